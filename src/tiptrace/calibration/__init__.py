@@ -1,0 +1,1 @@
+"""What a user measures once: gel, rig, tip."""

@@ -1,0 +1,1 @@
+"""Estimators: anchoring, motion, propagation. They see markers and poses, never images."""

@@ -1,0 +1,1 @@
+"""Rigid transforms, point-set alignment and fixed points: pure functions on arrays."""
