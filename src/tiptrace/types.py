@@ -160,6 +160,7 @@ class Observation:
         right: Right finger.
         phase: Segment that the pair belongs to; None where the stream has no phase marks.
         opening_m: Gripper opening, where a topic tells it.
+        poses: Pose samples since the previous pair, in order, for estimators that model latency.
     """
 
     stamp_ns: int
@@ -167,6 +168,11 @@ class Observation:
     right: FingerObservation
     phase: Phase | None = None
     opening_m: float | None = None
+    poses: tuple[PoseSample, ...] = ()
+
+    def finger(self, side: Side) -> FingerObservation:
+        """One side."""
+        return self.left if side == "left" else self.right
 
 
 # --- estimates: what the tracer returns --------------------------------------------------------------------
@@ -187,6 +193,44 @@ class FingerMarkers:
     tracked: BoolArray
     uv_px: FloatArray | None = None
     depth_sigma_m: FloatArray | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class SensedFinger:
+    """Markers of one finger and where its sensor was at the exposure.
+
+    Attributes:
+        markers: Lifted markers.
+        T_B_E: (4, 4) end-effector pose at this side's exposure.
+        T_E_S: (4, 4) sensor pose in F_E at the current gripper opening.
+    """
+
+    markers: FingerMarkers
+    T_B_E: FloatArray
+    T_E_S: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class SensedPair:
+    """What an estimator sees of a pair: markers and poses, no images.
+
+    Attributes:
+        stamp_ns: Mean of the two capture stamps.
+        phase: Segment, None where unknown.
+        left: Left finger.
+        right: Right finger.
+        poses: Pose samples since the previous pair, in order.
+    """
+
+    stamp_ns: int
+    phase: Phase | None
+    left: SensedFinger
+    right: SensedFinger
+    poses: tuple[PoseSample, ...] = ()
+
+    def finger(self, side: Side) -> SensedFinger:
+        """One side."""
+        return self.left if side == "left" else self.right
 
 
 @dataclass(frozen=True, slots=True)
