@@ -33,6 +33,10 @@ class SimulationError(TipTraceError):
     """A trial that the virtual rig cannot perform: unknown name, no equilibrium, a grasp that does not hold."""
 
 
+class OutputError(TipTraceError):
+    """Results that cannot be written, or read back."""
+
+
 class MissingExtraError(TipTraceError):
     """An optional library is not installed."""
 
