@@ -1,0 +1,255 @@
+"""The soft gel under a rigid tool: surface height, tangential displacement, where material points go.
+
+Everything is in F_S: origin on the undeformed surface at the image centre, +x image right, +y image down,
++z out of the gel towards the object. The surface is found as the lowest elastic membrane on the tool: inside
+the contact it is the tool's surface, outside it relaxes over millimetres (the gel is 4 mm thick). All steps
+are continuous in the tool's position, so nothing jumps when the tool crosses a grid line.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from typing import Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import interpolate, ndimage
+
+from tiptrace.types import FloatArray
+
+Float32Array = NDArray[np.float32]
+Order = Literal[1, 3]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GelGrid:
+    """Regular grid of surface points in F_S; fields on it are indexed [y, x].
+
+    Attributes:
+        x_m: (nx,) columns, increasing, evenly spaced.
+        y_m: (ny,) rows, increasing, with the same spacing.
+    """
+
+    x_m: FloatArray
+    y_m: FloatArray
+
+    @property
+    def pitch_m(self) -> float:
+        """Distance between neighbours."""
+        return float(self.x_m[1] - self.x_m[0])
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(ny, nx)."""
+        return len(self.y_m), len(self.x_m)
+
+    def mesh(self) -> tuple[FloatArray, FloatArray]:
+        """X and Y of every grid point, (ny, nx) each, m."""
+        X, Y = np.meshgrid(self.x_m, self.y_m)
+        return X, Y
+
+    def at(
+        self, values: FloatArray | Float32Array, points: FloatArray, order: Literal[1, 3] = 3
+    ) -> FloatArray:
+        """Interpolate a field (ny, nx) at points (n, 2), m, by splines of the given order."""
+        rows = (points[:, 1] - self.y_m[0]) / self.pitch_m
+        columns = (points[:, 0] - self.x_m[0]) / self.pitch_m
+        field_values = np.asarray(values, dtype=np.float64)
+        at = np.stack([rows, columns])
+        if order == 1:
+            return ndimage.map_coordinates(field_values, at, order=1, mode="nearest")
+        return ndimage.map_coordinates(field_values, at, order=3, mode="nearest")
+
+
+def grid_over(width_m: float, height_m: float, pitch_m: float = 0.25e-3, margin_m: float = 2e-3) -> GelGrid:
+    """Grid centred on the image, a margin wider on each side."""
+    nx, ny = (2 * round((size / 2 + margin_m) / pitch_m) for size in (width_m, height_m))
+    x_m = pitch_m * (np.arange(nx, dtype=np.float64) - (nx - 1) / 2)
+    y_m = pitch_m * (np.arange(ny, dtype=np.float64) - (ny - 1) / 2)
+    return GelGrid(x_m, y_m)
+
+
+GEL_GRID = grid_over(20e-3, 15e-3)
+
+
+@dataclass(frozen=True, slots=True)
+class PadContact:
+    """What the physics knows of one pad at one instant.
+
+    Attributes:
+        penetration_m: (ny, nx) overlap of the rigid tool with the undeformed gel at each grid point: ≥ 0
+            inside the contact, negative where there is a gap. It must be continuous in space: beyond the
+            tool's outline let it fall by ``WALL_SLOPE`` times the distance to the outline
+            (``p(nearest point of the outline) − WALL_SLOPE · distance``), never to −∞ in one step.
+        nodes_m: (k, 2) rest positions of the surface points in contact, m; k may be 0.
+        shear_m: (k, 2) tangential displacement of the surface at these points, m.
+    """
+
+    penetration_m: FloatArray
+    nodes_m: FloatArray
+    shear_m: FloatArray
+
+
+WALL_SLOPE = 3.0
+"""Fall of penetration per metre beyond a tool's outline: a gel does not follow a steeper wall."""
+
+
+@dataclass(frozen=True, slots=True)
+class GelParameters:
+    """How the gel yields around and under a contact.
+
+    Attributes:
+        thickness_m: Gel from coating to backing.
+        skirt_m: Distance over which the surface rises beside a contact.
+        tail_m: Distance of the wide, shallow part of the skirt.
+        tail_weight: Share of the wide part, 0 to 1.
+        coating_m: Radius over which the painted coating rounds every kink.
+        shear_decay_m: Distance over which tangential displacement dies out beside the contact.
+        follow_m: Reach of a contact node's displacement inside the contact (about the nodes' pitch).
+    """
+
+    thickness_m: float = 4e-3
+    skirt_m: float = 0.55e-3
+    tail_m: float = 2.0e-3
+    tail_weight: float = 0.15
+    coating_m: float = 0.15e-3
+    shear_decay_m: float = 2.5e-3
+    follow_m: float = 1.0e-3
+
+
+@dataclass(frozen=True, slots=True)
+class GelDeformation:
+    """A deformed gel.
+
+    Attributes:
+        grid: Where the fields are sampled.
+        height_m: (ny, nx) surface height along +z_S: 0 untouched, negative pressed in.
+        engaged: (ny, nx) how far the surface follows the tool sideways: 1 in contact, falling to 0 outside.
+        contact: What caused it.
+        parameters: The gel.
+    """
+
+    grid: GelGrid
+    height_m: Float32Array
+    engaged: Float32Array
+    contact: PadContact
+    parameters: GelParameters = field(default_factory=GelParameters)
+
+    def displacement(self, points_xy: FloatArray) -> FloatArray:
+        """Displacement (n, 3), m, of the surface points that rest at ``points_xy`` (n, 2), m."""
+        shear = _shear_at(self, points_xy)  # (n, 2)
+        height = self.grid.at(self.height_m, points_xy + shear)  # (n,)
+        return np.column_stack([shear, height])
+
+    def dots(self, rest_xy: FloatArray, shown_fraction: float = 1.0) -> FloatArray:
+        """Positions (n, 3), m, of dots that lie below the surface and show a fraction of its motion.
+
+        Args:
+            rest_xy: (n, 2) rest positions, m.
+            shown_fraction: Share of the surface's tangential displacement that a dot makes.
+        """
+        moved = rest_xy + shown_fraction * _shear_at(self, rest_xy)  # (n, 2)
+        return np.column_stack([moved, self.grid.at(self.height_m, moved)])
+
+
+def untouched(grid: GelGrid = GEL_GRID, parameters: GelParameters | None = None) -> GelDeformation:
+    """The gel before any contact."""
+    gap = PadContact(np.full(grid.shape, -1e-3), np.zeros((0, 2)), np.zeros((0, 2)))
+    zero = np.zeros(grid.shape, np.float32)
+    return GelDeformation(grid, zero, zero.copy(), gap, parameters or GelParameters())
+
+
+def deform(
+    contact: PadContact, grid: GelGrid = GEL_GRID, parameters: GelParameters | None = None
+) -> GelDeformation:
+    """Surface and displacement field of the gel under a tool.
+
+    Args:
+        contact: Overlap and contact nodes, sampled on ``grid``.
+        grid: Where fields are sampled.
+        parameters: The gel; defaults to a fresh GelSight Mini pad.
+    """
+    gel = parameters or GelParameters()
+    overlap = contact.penetration_m.astype(np.float32)
+    if not (overlap > 0).any():
+        return replace(untouched(grid, gel), contact=contact)
+    depth = _drape(overlap, grid.pitch_m, gel)
+    touching = np.asarray(np.clip(overlap / 30e-6, 0, 1), dtype=np.float32)
+    engaged = _spread(touching, grid.pitch_m, gel.shear_decay_m)
+    return GelDeformation(grid, -depth, engaged, contact, gel)
+
+
+def _drape(overlap: Float32Array, pitch_m: float, gel: GelParameters) -> Float32Array:
+    """Depth of the membrane over the tool: u = max(overlap, K u), K a decaying smoothing kernel.
+
+    Where the tool is away, u = K u with K = γ G_σ means (1 − γ) u = σ²/2 ∇²u: an exponential skirt of length
+    σ/√(2(1 − γ)). A narrow and a wide kernel together give the long shallow tail of an elastic layer.
+    """
+    narrow = gel.skirt_m * 0.7  # σ of the narrow kernel; γ then follows
+    kept = np.float32(1 - 0.5 * (narrow / gel.skirt_m) ** 2)
+    wide = np.float32(gel.tail_weight)
+    u = np.maximum(overlap, 0)
+    for step in range(14):
+        near = _blur(u, narrow / pitch_m)
+        if step % 2 == 0:
+            far = _blur(u, gel.tail_m / pitch_m)
+        u = np.maximum(overlap, (kept * (1 - wide)) * near + wide * kept * far)
+    return _blur(u, gel.coating_m / pitch_m)
+
+
+def _spread(contact: Float32Array, pitch_m: float, decay_m: float) -> Float32Array:
+    """1 in contact, about e^(−distance/decay) outside, by the same relaxation, from coarse to fine."""
+    a = contact
+    for share, steps in ((0.4, 14), (0.2, 8), (0.1, 8)):  # σ as a share of the decay; γ = 1 − share²/2
+        kept = np.float32(1 - 0.5 * share**2)
+        for _ in range(steps):
+            a = np.maximum(contact, kept * _blur(a, share * decay_m / pitch_m))
+    return a
+
+
+def _blur(values: Float32Array, sigma_cells: float) -> Float32Array:
+    size = 2 * int(np.ceil(2.5 * sigma_cells)) + 1
+    out = cv2.GaussianBlur(values, (size, size), sigma_cells, borderType=cv2.BORDER_REPLICATE)
+    return np.asarray(out, dtype=np.float32)
+
+
+def _shear_at(deformation: GelDeformation, points: FloatArray) -> FloatArray:
+    """Tangential displacement (n, 2): a local rigid-like fit to the contact nodes, fading outside."""
+    contact, gel = deformation.contact, deformation.parameters
+    if len(contact.nodes_m) == 0:
+        return np.zeros((len(points), 2))
+    overlap = deformation.grid.at(contact.penetration_m, contact.nodes_m, order=1)  # (k,)
+    weight = np.clip(overlap / 50e-6, 1e-3, 1)  # a node that just touches counts little: no jumps
+    fit = _local_linear(points, contact.nodes_m, contact.shear_m, weight, gel.follow_m)
+    engaged = deformation.grid.at(deformation.engaged, points, order=1)
+    return fit * np.clip(engaged, 0, 1)[:, None]
+
+
+def _local_linear(
+    points: FloatArray, nodes: FloatArray, values: FloatArray, weight: FloatArray, reach: float
+) -> FloatArray:
+    """Moving least squares of first order: exact for fields linear in position, bounded outside."""
+    d2 = ((points[:, None] - nodes[None]) ** 2).sum(-1) / (2 * reach**2)  # (n, k)
+    w = weight * np.exp(d2.min(axis=1, keepdims=True) - d2)
+    w /= w.sum(axis=1, keepdims=True)
+    centre, mean = w @ nodes, w @ values  # (n, 2)
+    dx = nodes[None] - centre[:, None]  # (n, k, 2)
+    C = np.einsum("nk,nki,nkj->nij", w, dx, dx) + 1e-3 * reach**2 * np.eye(2)
+    B = np.einsum("nk,nki,kj->nij", w, dx, values)
+    slope = np.linalg.solve(C, B)  # (n, 2, 2)
+    offset = points - centre
+    far = np.linalg.norm(offset, axis=1, keepdims=True) / (2 * reach)
+    return np.asarray(mean + np.einsum("ni,nij->nj", offset / np.sqrt(1 + far**4), slope))
+
+
+@lru_cache(maxsize=16)
+def _spline_rows(knots: tuple[float, ...], points: tuple[float, ...], derivative: int) -> FloatArray:
+    spline = interpolate.make_interp_spline(np.asarray(knots), np.eye(len(knots)), k=3)
+    return np.asarray(spline(np.asarray(points), nu=derivative))
+
+
+def sampling_matrix(knots_m: FloatArray, points_m: FloatArray, derivative: int = 0) -> FloatArray:
+    """Matrix (n, m) from values at m even knots to a cubic spline's value or derivative at n points."""
+    return _spline_rows(tuple(knots_m.tolist()), tuple(points_m.tolist()), derivative)
