@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.intp]
 Image = NDArray[np.uint8]  # (height, width, 3), BGR as OpenCV has it
 
 Side = Literal["left", "right"]
