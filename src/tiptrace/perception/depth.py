@@ -1,0 +1,117 @@
+"""Depth map of one image by the paper's chain: normals, mask, nearest fill, Poisson, baseline (Sec. II-B)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tiptrace.perception.fill import nearest_fill
+from tiptrace.perception.gel_model import GelModel
+from tiptrace.perception.markers import check_image
+from tiptrace.perception.poisson import PoissonSolver
+from tiptrace.types import BoolArray, Image
+
+Float32Map = NDArray[np.float32]
+
+_FLAT = 0.03  # change of slope below which gel counts as flat, m/m
+_SHALLOW = 0.25  # of the depth range: flat gel above this level is touched
+_SHALLOW_M = 60e-6  # … but never closer to the lowest gel than its noise
+_VISIBLE = 0.01  # of the image that must be untouched for its median to be the zero level
+
+
+@dataclass(frozen=True, slots=True)
+class DepthMap:
+    """Indentation of the gel.
+
+    Attributes:
+        depth_m: (H, W) float32, positive = pressed in.
+        untouched: (H, W) where the gel counts as untouched.
+        zero_visible: False if too little untouched gel was seen and the border stood in for the zero level.
+    """
+
+    depth_m: Float32Map
+    untouched: BoolArray
+    zero_visible: bool
+
+
+class PaperDepth:
+    """The paper's depth chain at full resolution, against one reference image."""
+
+    def __init__(
+        self,
+        gel: GelModel,
+        reference: Image,
+        metres_per_px: tuple[float, float],
+        marker_threshold: tuple[float, float],
+    ) -> None:
+        """Prepare, and integrate the baseline from the image of the untouched gel, (H, W, 3) uint8 BGR.
+
+        Raises:
+            PerceptionError: an unusable reference.
+        """
+        check_image(reference)
+        H, W = reference.shape[:2]
+        self._gel, self._threshold = gel, marker_threshold
+        v, u = np.indices((H, W), dtype=np.float32)
+        self._unit_uv = np.stack([u / W, v / H], axis=-1).reshape(-1, 2)  # (HW, 2)
+        self._reference = reference.astype(np.float32)
+        self._solver = PoissonSolver((H, W), metres_per_px)
+        self._slopes_0 = self._slopes(reference)  # (H, W, 2)
+        self._z_0 = self._integrate(self._slopes_0)
+
+    def __call__(self, image: Image) -> DepthMap:
+        """Depth of an image of the same size, (H, W, 3) uint8 BGR.
+
+        Raises:
+            PerceptionError: another size, black, overexposed, or all of it masked.
+        """
+        H, W = self._z_0.shape
+        check_image(image, (W, H))
+        slopes = self._slopes(image)
+        h = self._z_0 - self._integrate(slopes)  # h = −(z − z_baseline)
+        untouched, visible = untouched_gel(h, slopes - self._slopes_0)
+        h -= zero_level(h, untouched, visible)
+        return DepthMap(depth_m=h, untouched=untouched, zero_visible=visible)
+
+    def _slopes(self, image: Image) -> Float32Map:
+        """Slopes (H, W, 2): network where the grey level is not a marker's, nearest value elsewhere."""
+        grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+        masked = (grey >= self._threshold[0]) & (grey <= self._threshold[1])  # (H, W)
+        colours = image.astype(np.float32)
+        if self._gel.convention.background == "ratio":
+            colours = np.asarray(colours / np.maximum(self._reference, 1.0) - 1.0, dtype=np.float32)
+        seen = ~masked.ravel()
+        slopes = np.zeros((seen.size, 2), dtype=np.float32)
+        slopes[seen] = self._gel.slopes(colours.reshape(-1, 3)[seen], self._unit_uv[seen])
+        return nearest_fill(slopes.reshape(*grey.shape, 2), np.asarray(masked, dtype=np.bool_))
+
+    def _integrate(self, slopes: Float32Map) -> Float32Map:
+        return self._solver.integrate(slopes[..., 0], slopes[..., 1])
+
+
+def untouched_gel(h: Float32Map, slope_change: Float32Map) -> tuple[BoolArray, bool]:
+    """Where the gel is untouched: flat as in the reference, and among the least deep.
+
+    Args:
+        h: (H, W) depth up to a constant, m.
+        slope_change: (H, W, 2) slopes minus those of the reference.
+
+    Returns:
+        (H, W) mask, and whether it is large enough to define the zero level.
+    """
+    smooth = cv2.GaussianBlur(slope_change, (0, 0), max(h.shape[1] / 160.0, 1.0))
+    flat = np.hypot(smooth[..., 0], smooth[..., 1]) < _FLAT
+    lowest, deepest = np.percentile(h, (5, 99))
+    untouched = flat & (h < lowest + max(_SHALLOW * (deepest - lowest), _SHALLOW_M))
+    return np.asarray(untouched, dtype=np.bool_), bool(untouched.mean() >= _VISIBLE)
+
+
+def zero_level(h: Float32Map, untouched: BoolArray, visible: bool) -> np.float32:
+    """Level that becomes depth 0: median over untouched gel, else the lowest decile of the image's border."""
+    if visible:
+        return np.float32(np.median(h[untouched]))
+    border = np.concatenate([h[0], h[-1], h[:, 0], h[:, -1]])
+    return np.float32(np.percentile(border, 10))
