@@ -78,6 +78,12 @@ def test_bad_images_are_refused(image, message):
         finger.sense(image)
 
 
+def test_the_message_names_the_finger():
+    finger = Finger(SENSOR, linear_gel(), gel_image(), PAPER, side="left")
+    with pytest.raises(PerceptionError, match="^left finger: tactile image is black"):
+        finger.sense(np.zeros((H, W, 3), np.uint8))
+
+
 def test_without_reference():
     with pytest.raises(PerceptionError, match="untouched gel"):
         Finger(SENSOR, linear_gel(), None, PAPER)
