@@ -9,13 +9,12 @@ are continuous in the tool's position, so nothing jumps when the tool crosses a 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 from typing import Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy import interpolate, ndimage
+from scipy import ndimage, sparse
 
 from tiptrace.types import FloatArray
 
@@ -111,8 +110,8 @@ class GelParameters:
     """
 
     thickness_m: float = 4e-3
-    skirt_m: float = 0.55e-3
-    tail_m: float = 2.0e-3
+    skirt_m: float = 0.8e-3
+    tail_m: float = 2.2e-3
     tail_weight: float = 0.15
     coating_m: float = 0.15e-3
     shear_decay_m: float = 2.5e-3
@@ -234,22 +233,42 @@ def _local_linear(
     d2 = ((points[:, None] - nodes[None]) ** 2).sum(-1) / (2 * reach**2)  # (n, k)
     w = weight * np.exp(d2.min(axis=1, keepdims=True) - d2)
     w /= w.sum(axis=1, keepdims=True)
-    centre, mean = w @ nodes, w @ values  # (n, 2)
-    dx = nodes[None] - centre[:, None]  # (n, k, 2)
-    C = np.einsum("nk,nki,nkj->nij", w, dx, dx) + 1e-3 * reach**2 * np.eye(2)
-    B = np.einsum("nk,nki,kj->nij", w, dx, values)
-    slope = np.linalg.solve(C, B)  # (n, 2, 2)
+    products = [nodes[:, i] * other[:, j] for other in (nodes, values) for i in (0, 1) for j in (0, 1)]
+    moments = np.einsum("nk,kf->nf", w, np.column_stack([nodes, values, *products]))  # (n, 12)
+    centre, mean = moments[:, :2], moments[:, 2:4]
+    C = moments[:, 4:8].reshape(-1, 2, 2) - centre[:, :, None] * centre[:, None, :]
+    B = moments[:, 8:12].reshape(-1, 2, 2) - centre[:, :, None] * mean[:, None, :]
+    slope = np.linalg.solve(C + 1e-3 * reach**2 * np.eye(2), B)  # (n, 2, 2)
     offset = points - centre
     far = np.linalg.norm(offset, axis=1, keepdims=True) / (2 * reach)
     return np.asarray(mean + np.einsum("ni,nij->nj", offset / np.sqrt(1 + far**4), slope))
 
 
-@lru_cache(maxsize=16)
-def _spline_rows(knots: tuple[float, ...], points: tuple[float, ...], derivative: int) -> FloatArray:
-    spline = interpolate.make_interp_spline(np.asarray(knots), np.eye(len(knots)), k=3)
-    return np.asarray(spline(np.asarray(points), nu=derivative))
+def spline_coefficients(values: Float32Array) -> Float32Array:
+    """Coefficients of the cubic B-splines that pass through a field on the grid."""
+    return ndimage.spline_filter(values, order=3, mode="mirror", output=np.float32)
 
 
-def sampling_matrix(knots_m: FloatArray, points_m: FloatArray, derivative: int = 0) -> FloatArray:
-    """Matrix (n, m) from values at m even knots to a cubic spline's value or derivative at n points."""
-    return _spline_rows(tuple(knots_m.tolist()), tuple(points_m.tolist()), derivative)
+def spline_basis(knots_m: FloatArray, points_m: FloatArray, derivative: int = 0) -> sparse.csr_array:
+    """Matrix (n, m) from m cubic B-spline coefficients on even knots to values (or slopes) at n points.
+
+    Sparse, so that sampling a field stays on one core and costs four products a point and direction.
+    """
+    pitch = float(knots_m[1] - knots_m[0])
+    t = np.clip((points_m - knots_m[0]) / pitch, 1, len(knots_m) - 2.001)
+    cell = np.floor(t).astype(int)
+    f = t - cell
+    if derivative == 0:
+        taps = [
+            (1 - f) ** 3 / 6,
+            (3 * f**3 - 6 * f**2 + 4) / 6,
+            (-3 * f**3 + 3 * f**2 + 3 * f + 1) / 6,
+            f**3 / 6,
+        ]
+    else:
+        taps = [-((1 - f) ** 2) / 2, (3 * f**2 - 4 * f) / 2, (-3 * f**2 + 2 * f + 1) / 2, f**2 / 2]
+    weights = np.stack(taps, axis=1) / pitch**derivative  # (n, 4)
+    columns = cell[:, None] + np.arange(-1, 3)
+    rows = np.repeat(np.arange(len(t)), 4)
+    entries = (weights.ravel().astype(np.float32), (rows, columns.ravel()))
+    return sparse.csr_array(entries, shape=(len(t), len(knots_m)))

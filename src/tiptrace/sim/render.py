@@ -11,9 +11,17 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from scipy import sparse
 
 from tiptrace.sim.dots import DotLayout, DotTruth, dot_transmission, place_dots
-from tiptrace.sim.gel import Float32Array, GelDeformation, GelGrid, sampling_matrix, untouched
+from tiptrace.sim.gel import (
+    Float32Array,
+    GelDeformation,
+    GelGrid,
+    spline_basis,
+    spline_coefficients,
+    untouched,
+)
 from tiptrace.sim.optics import Optics, irradiance, nominal_optics, untouched_colour
 from tiptrace.types import FloatArray, Image
 
@@ -75,6 +83,9 @@ class TactileRenderer:
         self.shown_fraction = shown_fraction
         self.metres_per_px = metres_per_px
         self.seed = seed
+        self._grid: GelGrid | None = None
+        self._rows: list[sparse.csr_array] = []
+        self._columns: list[sparse.csr_array] = []
         width, height = image_size_px
         self.x_m: FloatArray = (np.arange(width, dtype=np.float64) - (width - 1) / 2) * metres_per_px[0]
         self.y_m: FloatArray = (np.arange(height, dtype=np.float64) - (height - 1) / 2) * metres_per_px[1]
@@ -138,24 +149,26 @@ class TactileRenderer:
             raise ValueError("this gel has no dots: give the renderer a DotLayout")
         return place_dots(self.dots, deformation, self.shown_fraction, self.metres_per_px, self._size_px)
 
-    def heights(self, deformation: GelDeformation) -> FloatArray:
+    def heights(self, deformation: GelDeformation) -> Float32Array:
         """True surface height along +z_S at each pixel, (height, width), m."""
-        A_y, A_x = self._sampling(deformation.grid, 0, 0)
-        return np.asarray(A_y @ deformation.height_m.astype(np.float64) @ A_x.T)
+        return self._sample(deformation, 0, 0)
 
     def slopes(self, deformation: GelDeformation) -> tuple[Float32Array, Float32Array]:
         """∂z/∂x and ∂z/∂y at each pixel, (height, width) each."""
-        grid, H = deformation.grid, deformation.height_m
-        A_y, dA_x = (A.astype(np.float32) for A in self._sampling(grid, 0, 1))
-        dA_y, A_x = (A.astype(np.float32) for A in self._sampling(grid, 1, 0))
-        return A_y @ (H @ dA_x.T), dA_y @ (H @ A_x.T)
+        return self._sample(deformation, 0, 1), self._sample(deformation, 1, 0)
 
     @property
     def _size_px(self) -> tuple[int, int]:
         return len(self.x_m), len(self.y_m)
 
-    def _sampling(self, grid: GelGrid, nu_y: int, nu_x: int) -> tuple[FloatArray, FloatArray]:
-        return sampling_matrix(grid.y_m, self.y_m, nu_y), sampling_matrix(grid.x_m, self.x_m, nu_x)
+    def _sample(self, deformation: GelDeformation, nu_y: int, nu_x: int) -> Float32Array:
+        grid = deformation.grid
+        if grid is not self._grid:
+            self._grid = grid
+            self._rows = [spline_basis(grid.y_m, self.y_m, nu) for nu in (0, 1)]
+            self._columns = [spline_basis(grid.x_m, self.x_m, nu) for nu in (0, 1)]
+        along_x = self._columns[nu_x] @ spline_coefficients(deformation.height_m).T  # (width, ny)
+        return np.asarray(self._rows[nu_y] @ along_x.T, np.float32)
 
     def _lamp_level(self, rng: np.random.Generator, time_s: float) -> Float32Array:
         rise = self.noise.drift_limit * np.tanh(
