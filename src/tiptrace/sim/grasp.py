@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -146,6 +146,11 @@ class Grasp:
             iteration = limit
         force, moment = float(np.linalg.norm(wrench[:3])), float(np.linalg.norm(wrench[3:]))
         return Equilibrium(R, p, pads, tip, force, moment, iteration)
+
+    def take_hold(self, state: GraspState, world: World) -> GraspState:
+        """The pads touch the tool where it is, without shear: the fingers close on a tool held by someone."""
+        _, _, pads, _ = self.balance(state, world, state.R, state.p, 1e-3)
+        return replace(state, pads=advance_pads(self.pads, state.pads, pads, state.R, state.p, 1e-3))
 
     def advance(self, state: GraspState, equilibrium: Equilibrium, dt_s: float) -> GraspState:
         """State after a converged step."""
