@@ -6,16 +6,37 @@ import sys
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 
+import tiptrace
+from tiptrace.cli.calibrate_tip import calibrate_tip
 from tiptrace.errors import TipTraceError
 
 app = typer.Typer(
-    help="Where a grasped tool touches the world.",
+    help="Where a grasped tool touches the world: tip trajectories from two tactile sensors and the robot's pose.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
-    rich_markup_mode="rich",
 )
+calibrate = typer.Typer(help="What is measured once: gel, tip, rig.", no_args_is_help=True)
+app.add_typer(calibrate, name="calibrate")
+
+calibrate.command("tip")(calibrate_tip)
+
+
+def _version(show: bool) -> None:
+    if show:
+        typer.echo(f"tiptrace {tiptrace.__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: bool = typer.Option(
+        False, "--version", callback=_version, is_eager=True, help="Print the version."
+    ),
+) -> None:
+    pass
 
 
 def main() -> None:
@@ -23,5 +44,7 @@ def main() -> None:
     try:
         app()
     except TipTraceError as error:
-        Console(stderr=True).print(f"[bold red]error:[/] {error}", highlight=False, soft_wrap=True)
+        Console(stderr=True).print(
+            f"[bold red]error:[/] {escape(str(error))}", highlight=False, soft_wrap=True
+        )
         sys.exit(2)

@@ -6,7 +6,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from tiptrace.errors import GeometryError, PerceptionError
-from tiptrace.geometry.fixed_point import FixedPoint, FixedPointAccumulator
+from tiptrace.geometry.fixed_point import FixedPointAccumulator
 from tiptrace.geometry.kabsch import RigidMotion, kabsch
 from tiptrace.geometry.transforms import apply
 from tiptrace.types import (
@@ -76,7 +76,7 @@ class PaperEstimator:
             if motion is not None:
                 self._fixed_point.add(motion.R, motion.d)
             p_0 = self._solve_anchor()
-            return self._estimate(pair, motion, markers, p_0 and p_0.p, Status.ANCHORING)
+            return self._estimate(pair, motion, markers, p_0, Status.ANCHORING)
         if pair.phase is None:
             return TipEstimate(pair.stamp_ns, None, Status.LOST, markers=markers)
 
@@ -133,20 +133,28 @@ class PaperEstimator:
         except GeometryError:
             return None, int(seen.sum())
 
-    def _solve_anchor(self) -> FixedPoint | None:
-        """Running p̂_B(0), Eq. (fixedpoint_ls)."""
+    def _solve_anchor(self) -> FloatArray | None:
+        """Running p̂_B(0), Eq. (fixedpoint_ls); None while the motions leave it undetermined."""
         solution = self._fixed_point.solve()
-        if solution is not None:
-            self._anchor = Anchor(solution.p, None, solution.residual_m, solution.frames)
-        return solution
+        if solution is None:
+            return None
+        self._anchor = Anchor(solution.p, None, solution.residual_m, solution.frames)
+        return solution.p
 
     def _refuse(self, pair: SensedPair) -> None:
         if not any(event.kind == "anchor-refused" for event in self.events):
-            detail = "the anchoring motion leaves the tip undetermined: rotate the hand about two axes or more"
+            detail = (
+                "the anchoring motion leaves the tip undetermined: rotate the hand about two axes or more"
+            )
             self.events.append(Event("anchor-refused", pair.stamp_ns, pair.stamp_ns, detail))
 
     def _estimate(
-        self, pair: SensedPair, motion: RigidMotion | None, markers: int, p_B: FloatArray | None, status: Status
+        self,
+        pair: SensedPair,
+        motion: RigidMotion | None,
+        markers: int,
+        p_B: FloatArray | None,
+        status: Status,
     ) -> TipEstimate:
         if motion is None:
             return TipEstimate(pair.stamp_ns, pair.phase, Status.LOST, markers=markers)

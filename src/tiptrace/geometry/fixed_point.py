@@ -59,7 +59,7 @@ class FixedPointAccumulator:
         eigenvalues = np.linalg.eigvalsh(self._AtA)
         if self.frames == 0 or eigenvalues[0] <= _RANK_TOLERANCE * max(eigenvalues[2], _STILL_RAD**2):
             return None
-        p = np.linalg.solve(self._AtA, self._Atb)
+        p = np.asarray(np.linalg.solve(self._AtA, self._Atb), dtype=np.float64)
         squared = max(self._btb - float(p @ self._Atb), 0.0)  # ‖A p − b‖² at the optimum
         return FixedPoint(p, float(np.sqrt(squared / self.frames)), self.frames, self._AtA.copy())
 
@@ -103,7 +103,9 @@ def solve_pivot(T: ArrayLike) -> Pivot:
     R, t = T[:, :3, :3], T[:, :3, 3]
     cosine = (np.einsum("nij,ij->n", R, R[0]) - 1.0) / 2.0  # angle to the first pose
     if np.max(1.0 - cosine) < 1.0 - np.cos(_STILL_RAD):
-        raise GeometryError("the poses do not rotate: turn the tool about its resting tip, about two axes or more")
+        raise GeometryError(
+            "the poses do not rotate: turn the tool about its resting tip, about two axes or more"
+        )
     A = np.concatenate([R, np.broadcast_to(-np.eye(3), R.shape)], axis=2).reshape(-1, 6)  # (3n, 6)
     b = -t.reshape(-1)  # (3n,)
     U, s, Vt = np.linalg.svd(A, full_matrices=False)

@@ -34,7 +34,7 @@ def rotation_exp(w: ArrayLike) -> FloatArray:
     a = np.where(small, 1.0 - angle2 / 6.0, np.sin(safe) / safe)  # sin θ / θ
     b = np.where(small, 0.5 - angle2 / 24.0, (1.0 - np.cos(safe)) / safe**2)  # (1 − cos θ) / θ²
     S = skew(w)
-    return np.eye(3) + a * S + b * (S @ S)
+    return np.asarray(np.eye(3) + a * S + b * (S @ S))
 
 
 def rotation_log(R: ArrayLike) -> FloatArray:
@@ -56,12 +56,26 @@ def rotation_from_quaternion(q_xyzw: ArrayLike) -> FloatArray:
     q = np.asarray(q_xyzw, dtype=np.float64)
     norm = np.linalg.norm(q, axis=-1)
     if not np.all(np.abs(norm - 1.0) < _UNIT_TOLERANCE):
-        raise GeometryError(f"quaternion is not a unit quaternion (norm {float(np.max(norm)):.4g}); expected x, y, z, w")
+        raise GeometryError(
+            f"quaternion is not a unit quaternion (norm {float(np.max(norm)):.4g}); expected x, y, z, w"
+        )
     x, y, z, w = np.moveaxis(q / norm[..., None], -1, 0)
     R = np.empty((*q.shape[:-1], 3, 3))
-    R[..., 0, 0], R[..., 0, 1], R[..., 0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)
-    R[..., 1, 0], R[..., 1, 1], R[..., 1, 2] = 2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)
-    R[..., 2, 0], R[..., 2, 1], R[..., 2, 2] = 2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)
+    R[..., 0, 0], R[..., 0, 1], R[..., 0, 2] = (
+        1 - 2 * (y * y + z * z),
+        2 * (x * y - z * w),
+        2 * (x * z + y * w),
+    )
+    R[..., 1, 0], R[..., 1, 1], R[..., 1, 2] = (
+        2 * (x * y + z * w),
+        1 - 2 * (x * x + z * z),
+        2 * (y * z - x * w),
+    )
+    R[..., 2, 0], R[..., 2, 1], R[..., 2, 2] = (
+        2 * (x * z - y * w),
+        2 * (y * z + x * w),
+        1 - 2 * (x * x + y * y),
+    )
     return R
 
 
