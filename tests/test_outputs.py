@@ -10,13 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evaluation.builders import straight_truth, trajectory_of, truth_of
 from tiptrace.errors import OutputError
 from tiptrace.evaluation.metrics import evaluate
 from tiptrace.evaluation.quality import Quality, assess
 from tiptrace.geometry.transforms import rotation_exp
 from tiptrace.outputs import COLUMNS, read_csv, read_results, write_atomic, write_results
 from tiptrace.types import Anchor, Event, Phase, Status, TipEstimate, TipTrajectory
+
+from .evaluation.builders import straight_truth, trajectory_of, truth_of
 
 STAMP = 1_700_000_000_123_456_789
 

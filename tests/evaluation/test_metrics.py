@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from evaluation.builders import FRAME_NS, START_NS, straight_truth, trajectory_of, truth_of
 from tiptrace.evaluation.metrics import CHI2_3_95, evaluate
 from tiptrace.evaluation.truth import Truth
 from tiptrace.types import Phase, Status, TipEstimate, TipTrajectory, TruthSample
+
+from .builders import START_NS, straight_truth, trajectory_of, truth_of
 
 
 def test_a_perfect_trace_has_no_error():
@@ -151,11 +152,11 @@ def test_loop_rate_is_frames_over_time_spent():
 def test_coverage_of_a_right_covariance_is_95_percent():
     rng = np.random.default_rng(0)
     A = np.array([[1.0, 0.2, 0.0], [0.0, 0.5, 0.1], [0.3, 0.0, 2.0]]) * 1e-3
-    p = straight_truth(moving=4000, step_m=1e-4)
+    p = straight_truth(moving=1500, step_m=1e-4)
     errors = rng.standard_normal(p.shape) @ A.T
     m = evaluate(trajectory_of(p + errors, 5, anchor=p[0], covariance=A @ A.T), truth_of(p))
-    assert m.coverage_95 == pytest.approx(0.95, abs=0.015)
-    assert m.nees_median == pytest.approx(2.366, abs=0.15)  # median of χ²₃
+    assert m.coverage_95 == pytest.approx(0.95, abs=0.02)
+    assert m.nees_median == pytest.approx(2.366, abs=0.25)  # median of χ²₃
     too_sure = evaluate(trajectory_of(p + errors, 5, anchor=p[0], covariance=A @ A.T / 9), truth_of(p))
     assert too_sure.coverage_95 < 0.7
     assert pytest.approx(7.8147, abs=1e-4) == CHI2_3_95
@@ -166,4 +167,3 @@ def test_motion_of_the_tip_during_anchoring_is_told():
     p[2, 1] = 0.4e-3
     m = evaluate(trajectory_of(p, 5, anchor=p[0]), truth_of(p))
     assert m.anchoring_truth_motion_mm == pytest.approx(0.4)
-    assert FRAME_NS == 40_000_000

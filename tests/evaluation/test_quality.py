@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from evaluation.builders import straight_truth, trajectory_of
 from tiptrace.evaluation.quality import assess
 from tiptrace.types import Event, Phase, Status, TipEstimate, TipTrajectory
+
+from .builders import straight_truth, trajectory_of
 
 
 def test_a_sound_trace_passes():
