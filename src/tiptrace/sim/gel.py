@@ -103,8 +103,9 @@ class GelParameters:
         thickness_m: Gel from coating to backing.
         skirt_m: Distance over which the surface rises beside a contact.
         tail_m: Distance of the wide, shallow part of the skirt.
-        tail_weight: Share of the wide part, 0 to 1.
-        coating_m: Radius over which the painted coating rounds every kink.
+        tail_weight: Strength w of the wide part, below 1.
+        rounding_m: Radius over which the coating bridges the tool's own edges.
+        coating_m: Radius over which it rounds the rim of the contact.
         shear_decay_m: Distance over which tangential displacement dies out beside the contact.
         follow_m: Reach of a contact node's displacement inside the contact (about the nodes' pitch).
     """
@@ -112,8 +113,9 @@ class GelParameters:
     thickness_m: float = 4e-3
     skirt_m: float = 0.8e-3
     tail_m: float = 2.2e-3
-    tail_weight: float = 0.15
-    coating_m: float = 0.15e-3
+    tail_weight: float = 0.45
+    rounding_m: float = 0.3e-3
+    coating_m: float = 0.1e-3
     shear_decay_m: float = 2.5e-3
     follow_m: float = 1.0e-3
 
@@ -174,34 +176,45 @@ def deform(
     overlap = contact.penetration_m.astype(np.float32)
     if not (overlap > 0).any():
         return replace(untouched(grid, gel), contact=contact)
-    depth = _drape(overlap, grid.pitch_m, gel)
-    touching = np.asarray(np.clip(overlap / 30e-6, 0, 1), dtype=np.float32)
-    engaged = _spread(touching, grid.pitch_m, gel.shear_decay_m)
+    depth = _drape(_round_edges(overlap, gel.rounding_m / grid.pitch_m), grid.pitch_m, gel)
+    engaged = _spread(_coverage(overlap), grid.pitch_m, gel.shear_decay_m)
     return GelDeformation(grid, -depth, engaged, contact, gel)
 
 
-def _drape(overlap: Float32Array, pitch_m: float, gel: GelParameters) -> Float32Array:
-    """Depth of the membrane over the tool: u = max(overlap, K u), K a decaying smoothing kernel.
+def _round_edges(overlap: Float32Array, radius_cells: float) -> Float32Array:
+    """Bridge kinks of the tool, so that no edge falls between grid lines; spheres stay spheres (2 G − G²)."""
+    once = _blur(np.maximum(overlap, np.float32(-1e-3)), radius_cells)
+    return np.asarray(np.minimum(overlap, 2 * once - _blur(once, radius_cells)), dtype=np.float32)
 
-    Where the tool is away, u = K u with K = γ G_σ means (1 − γ) u = σ²/2 ∇²u: an exponential skirt of length
-    σ/√(2(1 − γ)). A narrow and a wide kernel together give the long shallow tail of an elastic layer.
+
+def _coverage(overlap: Float32Array) -> Float32Array:
+    """Share of each grid cell that is in contact: the distance to the rim, overlap / |∇overlap|, in cells."""
+    slope_y, slope_x = np.gradient(overlap)  # per cell
+    steepness = np.sqrt(slope_x**2 + slope_y**2)
+    covered = 0.5 + overlap / np.maximum(steepness, np.float32(1e-6))
+    return np.asarray(np.clip(covered, 0, 1), dtype=np.float32)
+
+
+def _drape(overlap: Float32Array, pitch_m: float, gel: GelParameters) -> Float32Array:
+    """Depth u of the membrane over the tool.
+
+    Where the tool is away, −λ² ∇²u + u = w G_tail u: an exponential skirt of length λ with a long, shallow tail
+    as an elastic layer has it. Relaxed as u = max(overlap, γ G_σ u + (1 − γ) w G_tail u) with γ = 1 − σ²/(2 λ²),
+    from wide to narrow σ, so that it converges in a fixed number of steps.
     """
-    narrow = gel.skirt_m * 0.7  # σ of the narrow kernel; γ then follows
-    kept = np.float32(1 - 0.5 * (narrow / gel.skirt_m) ** 2)
-    wide = np.float32(gel.tail_weight)
-    u = np.maximum(overlap, 0)
-    for step in range(14):
-        near = _blur(u, narrow / pitch_m)
-        if step % 2 == 0:
-            far = _blur(u, gel.tail_m / pitch_m)
-        u = np.maximum(overlap, (kept * (1 - wide)) * near + wide * kept * far)
+    u: Float32Array = np.maximum(overlap, 0)
+    for share, steps in ((0.8, 8), (0.4, 8), (0.2, 8)):  # σ as a share of λ
+        kept = np.float32(1 - 0.5 * share**2)
+        far = (1 - kept) * np.float32(gel.tail_weight) * _blur(u, gel.tail_m / pitch_m)
+        for _ in range(steps):
+            u = np.maximum(overlap, kept * _blur(u, share * gel.skirt_m / pitch_m) + far)
     return _blur(u, gel.coating_m / pitch_m)
 
 
 def _spread(contact: Float32Array, pitch_m: float, decay_m: float) -> Float32Array:
     """1 in contact, about e^(−distance/decay) outside, by the same relaxation, from coarse to fine."""
     a = contact
-    for share, steps in ((0.4, 14), (0.2, 8), (0.1, 8)):  # σ as a share of the decay; γ = 1 − share²/2
+    for share, steps in ((0.4, 14), (0.2, 8), (0.1, 8)):  # σ as a share of the decay
         kept = np.float32(1 - 0.5 * share**2)
         for _ in range(steps):
             a = np.maximum(contact, kept * _blur(a, share * decay_m / pitch_m))

@@ -147,7 +147,7 @@ class TactileRenderer:
         """
         if self.dots is None:
             raise ValueError("this gel has no dots: give the renderer a DotLayout")
-        return place_dots(self.dots, deformation, self.shown_fraction, self.metres_per_px, self._size_px)
+        return place_dots(self.dots, deformation, self.shown_fraction, self.metres_per_px, self.size_px)
 
     def heights(self, deformation: GelDeformation) -> Float32Array:
         """True surface height along +z_S at each pixel, (height, width), m."""
@@ -158,7 +158,8 @@ class TactileRenderer:
         return self._sample(deformation, 0, 1), self._sample(deformation, 1, 0)
 
     @property
-    def _size_px(self) -> tuple[int, int]:
+    def size_px(self) -> tuple[int, int]:
+        """Width and height of the image."""
         return len(self.x_m), len(self.y_m)
 
     def _sample(self, deformation: GelDeformation, nu_y: int, nu_x: int) -> Float32Array:
