@@ -160,7 +160,9 @@ def pad_forces(
     memory = law.creep / (1.0 + rho)  # and on the relaxed part
     r = pads.X - p  # (n, 3)
     o = tool.overlap(r @ R, pads.side)
-    m = np.stack([-pads.side, o.slope_b, o.slope_l], axis=1) @ R.T  # (n, 3) ∇ overlap: along the tool's normal
+    m = (
+        np.stack([-pads.side, o.slope_b, o.slope_l], axis=1) @ R.T
+    )  # (n, 3) ∇ overlap: along the tool's normal
     touching = o.depth > 0.0
     kn = law.normal * pads.area_m2
     hard = law.stiffening / law.thickness_m
@@ -202,7 +204,9 @@ def pad_forces(
     Gx = np.concatenate([pads.ex, np.cross(a, pads.ex)], axis=1)
     Gy = np.concatenate([pads.ey, np.cross(a, pads.ey)], axis=1)
     wrench = wrench + t[:, 0] @ Gx + t[:, 1] @ Gy
-    stick = np.where(holds, ks * instant * scale, 0.0)  # tangent of the return mapping: across the slip direction
+    stick = np.where(
+        holds, ks * instant * scale, 0.0
+    )  # tangent of the return mapping: across the slip direction
     along = np.where(slipping, stick, 0.0)
     ux, uy = unit[:, 0], unit[:, 1]
     J -= Gx.T @ ((stick - along * ux * ux)[:, None] * Gx) + Gy.T @ ((stick - along * uy * uy)[:, None] * Gy)
@@ -211,7 +215,10 @@ def pad_forces(
     if np.any(slipping):
         Gu = ux[:, None] * Gx + uy[:, None] * Gy
         J -= Gu.T @ (np.where(slipping, friction * m_norm * k_n, 0.0)[:, None] * Gn)
-        for axis, slope, bend in ((1, o.slope_b, o.bend_b), (2, o.slope_l, o.bend_l)):  # the normal's own change
+        for axis, slope, bend in (
+            (1, o.slope_b, o.bend_b),
+            (2, o.slope_l, o.bend_l),
+        ):  # the normal's own change
             weight = np.where(slipping, friction * f_n * slope * bend / m_norm, 0.0)
             if np.any(weight):
                 e = R[:, axis]

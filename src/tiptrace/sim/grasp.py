@@ -179,6 +179,3 @@ def _newton_step(wrench: FloatArray, J: FloatArray) -> FloatArray:
         step = np.linalg.lstsq(J, -wrench, rcond=None)[0]
     size = max(float(np.linalg.norm(step[:3])) / 1e-3, float(np.linalg.norm(step[3:])) / 0.05, 1.0)
     return np.asarray(step / size)
-
-
-

@@ -132,7 +132,9 @@ def centreline_from_csv(path: Path) -> Centreline:
     except (OSError, ValueError) as error:
         raise SimulationError(f"{path}: not a curve of rows 'x, y' in mm ({error})") from None
     if rows.shape[1] != 2 or len(rows) < 4 or not np.all(np.isfinite(rows)):
-        raise SimulationError(f"{path}: a curve needs at least 4 finite rows 'x, y' in mm, got shape {rows.shape}")
+        raise SimulationError(
+            f"{path}: a curve needs at least 4 finite rows 'x, y' in mm, got shape {rows.shape}"
+        )
     if not np.all(np.diff(rows[:, 0]) > 0):
         raise SimulationError(f"{path}: x must increase from row to row: the hand travels along +x only")
     x, y = (rows - rows[0, :1] * [1.0, 0.0]).T * 1e-3
@@ -237,7 +239,9 @@ class Groove:
             distance = float(np.hypot(u, z))
             grad_u = -sign * grad_l
             gradient = (u * grad_u + z * _EZ) / distance
-            hessian = (np.outer(grad_u, grad_u) + _EZZ - u * sign * hess_l - np.outer(gradient, gradient)) / distance
+            hessian = (
+                np.outer(grad_u, grad_u) + _EZZ - u * sign * hess_l - np.outer(gradient, gradient)
+            ) / distance
             return Gap(distance, gradient, hessian, l, x, "edge")
         z_c, z_c1, z_c2 = self.pit.at(x)
         zeta = z - z_c

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from tiptrace.errors import SimulationError
 from tiptrace.sim.disturbances import LEVELS, Disturbances, LevelName
 
 AnchorMotionName = Literal["recommended", "two-axis", "one-axis", "pads"]
@@ -134,3 +135,24 @@ class TrialSpec(_Model):
         """For example ``T3-O1-W1-G1``."""
         trajectory = self.curve.stem if self.curve is not None else self.trajectory
         return f"{trajectory}-{self.tool}-{self.wrist}-{self.grasp}"
+
+
+def make_spec(**values: Any) -> TrialSpec:
+    """A spec from plain values.
+
+    Raises:
+        SimulationError: an unknown key or name (the valid ones are listed), or a value out of range.
+    """
+    try:
+        return TrialSpec(**values)
+    except ValidationError as error:
+        raise SimulationError("; ".join(_explain(e) for e in error.errors())) from None
+
+
+def _explain(error: Any) -> str:
+    where = ".".join(str(part) for part in error["loc"]) or "trial"
+    if error["type"] == "extra_forbidden":
+        return f"unknown setting '{where}'; valid settings: {', '.join(TrialSpec.model_fields)}"
+    if error["type"] == "literal_error":
+        return f"unknown {where} '{error['input']}'; valid: {error['ctx']['expected']}"
+    return f"{where} = {error['input']!r}: {error['msg']}"

@@ -150,11 +150,13 @@ class ToolShape:
         R, t = T_S_T[:3, :3], T_S_T[:3, 3]
         height = np.zeros(np.size(x))
         sides = np.full(np.size(x), side)
-        for _ in range(3):  # Newton along z_S: exact where the surface is flat, quadratic elsewhere
+        for _ in range(2):  # Newton along z_S: exact where the surface is flat, quadratic elsewhere
             points = np.stack([np.ravel(x), np.ravel(y), height], axis=1)
             o = self.overlap((points - t) @ R, sides)
             along_z = -side * R[2, 0] + o.slope_b * R[2, 1] + o.slope_l * R[2, 2]  # d(depth)/dz_S
-            height = height - o.depth / np.where(np.abs(along_z) > 0.2, along_z, np.sign(along_z) * 0.2 + 1e-9)
+            height = height - o.depth / np.where(
+                np.abs(along_z) > 0.2, along_z, np.sign(along_z) * 0.2 + 1e-9
+            )
         return height.reshape(np.shape(x))
 
 

@@ -111,7 +111,9 @@ class TrialPhysics:
         d = spec.disturbed_by
         law = GelLaw(youngs_pa=GelLaw().youngs_pa * d.gel_stiffness, stiffening=d.gel_stiffening)
         if self.groove is None:
-            line = named_centreline(spec.trajectory) if spec.curve is None else centreline_from_csv(spec.curve)
+            line = (
+                named_centreline(spec.trajectory) if spec.curve is None else centreline_from_csv(spec.curve)
+            )
             self.groove = Groove(line)
         self.groove.line.check(self.groove.radius_m)
         self.grasp = Grasp(Pads.at(self.T_E_S, law), self.tool, self.groove, TipLaw(), PLATE_ORIGIN_B)
@@ -189,7 +191,11 @@ class TrialPhysics:
         for index in range(self.frame_count):
             retried = False
             for k in range(substeps if index else 1):
-                t = index / spec.fps if k == substeps - 1 or not index else ((index - 1) + (k + 1) / substeps) / spec.fps
+                t = (
+                    index / spec.fps
+                    if k == substeps - 1 or not index
+                    else ((index - 1) + (k + 1) / substeps) / spec.fps
+                )
                 dt = max(t - t_last, 1e-4)
                 T = self.hand.pose(t)
                 self._guard(t)
