@@ -1,0 +1,77 @@
+"""What synchronisation dropped, and why."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from tiptrace.streams.pose_track import PoseGap
+from tiptrace.streams.topics import NS
+from tiptrace.types import SIDES, Event, Side
+
+
+def _per_side() -> dict[Side, int]:
+    return {"left": 0, "right": 0}
+
+
+@dataclass(slots=True)
+class SyncReport:
+    """Counts of what came in, what went out and what was dropped.
+
+    Attributes:
+        images: Images delivered.
+        pairs: Observations given.
+        unpaired: Images without a partner within the limit.
+        repeated: Images whose stamp had been seen.
+        late: Images that came after their time had been decided.
+        poses: Pose samples delivered.
+        poses_dropped: Pose samples whose stamp had been seen or whose time had passed.
+        pairs_without_pose: Pairs skipped because no pose could be claimed.
+        gaps: One ``pose-gap`` event per hole in the pose stream that cost pairs.
+    """
+
+    images: dict[Side, int] = field(default_factory=_per_side)
+    pairs: int = 0
+    unpaired: dict[Side, int] = field(default_factory=_per_side)
+    repeated: dict[Side, int] = field(default_factory=_per_side)
+    late: dict[Side, int] = field(default_factory=_per_side)
+    poses: int = 0
+    poses_dropped: int = 0
+    pairs_without_pose: int = 0
+    gaps: list[Event] = field(default_factory=list)
+    _last_gap: PoseGap | None = None
+
+    def add_gap(self, stamp_ns: int, gap: PoseGap) -> None:
+        """Note a pair that had to be skipped."""
+        self.pairs_without_pose += 1
+        if self.gaps and self._last_gap is not None and gap.before_ns == self._last_gap.before_ns:
+            last = self.gaps[-1]
+            self.gaps[-1] = Event(last.kind, last.start_ns, stamp_ns, last.detail)
+        else:
+            self.gaps.append(Event("pose-gap", stamp_ns, stamp_ns, _explain(gap)))
+        self._last_gap = gap
+
+    def sentences(self) -> list[str]:
+        """What a user should know, one sentence each; empty if nothing was lost."""
+        found = []
+        for side in SIDES:
+            for counts, what in (
+                (self.unpaired, "had no partner and were left out"),
+                (self.repeated, "repeated a stamp and were left out"),
+                (self.late, "came too late and were left out"),
+            ):
+                if counts[side]:
+                    found.append(f"{counts[side]} of {self.images[side]} {side} images {what}")
+        if self.poses_dropped:
+            found.append(f"{self.poses_dropped} of {self.poses} poses repeated a stamp or came too late")
+        if self.pairs_without_pose:
+            details = "; ".join(dict.fromkeys(event.detail for event in self.gaps[:3]))
+            found.append(f"{self.pairs_without_pose} image pairs had no pose and were left out: {details}")
+        return found
+
+
+def _explain(gap: PoseGap) -> str:
+    if gap.before_ns is None:
+        return "the images begin before the robot's poses" if gap.after_ns is not None else "no poses"
+    if gap.after_ns is None:
+        return "the images go on after the robot's poses"
+    return f"the robot's poses pause for {(gap.after_ns - gap.before_ns) / NS:.2f} s"
