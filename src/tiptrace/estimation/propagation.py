@@ -1,0 +1,67 @@
+"""Stage II: the tip through hand and grasp, with its covariance (``docs/estimation.md``, Propagation).
+
+``p_B(s − τ) = T_B_E(s − τ) [c_t + G⁻¹ D_t(c_t)]``, ``D_t(c) = R^E_t c + t^E_t − c``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tiptrace.estimation.motion import Motions
+from tiptrace.estimation.pose_track import HandStates
+from tiptrace.estimation.tip_map import DRIFT, C, TipMap
+from tiptrace.geometry.transforms import skew
+from tiptrace.types import FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Tip:
+    """The tip at one frame.
+
+    Attributes:
+        p_B: (3,) m.
+        covariance: (3, 3) m²: anchor, map, latency, motion and its nuisances.
+        shown_E: (3,) D_t, the displacement in the grasp that the markers show, m.
+        moved_E: (3,) G⁻¹ D_t, what the tool really did, m.
+    """
+
+    p_B: FloatArray
+    covariance: FloatArray
+    shown_E: FloatArray
+    moved_E: FloatArray
+
+
+def propagate(
+    tip_map: TipMap, motions: Motions, k: int, hand: HandStates, phase: float, noise_m: float
+) -> Tip:
+    """Tip of frame k of ``motions`` with the hand at its exposure.
+
+    Args:
+        tip_map: Stage I.
+        motions: In-grasp motions.
+        k: Frame.
+        hand: One hand state.
+        phase: t/T_I − 1, for the drift.
+        noise_m: Standard deviation of the hand pose at the tip, and of what the model leaves out.
+    """
+    R, t = motions.R[k], motions.t[k]
+    R_BE, t_BE = hand.T_B_E[0, :3, :3], hand.T_B_E[0, :3, 3]
+    c_t = tip_map.c + phase * tip_map.drift
+    G_inv = np.linalg.inv(tip_map.G)
+    D = R @ c_t + t - c_t
+    moved = G_inv @ D
+    p_B = R_BE @ (c_t + moved) + t_BE
+
+    J = np.zeros((3, 19))  # ∂p_B/∂θ
+    J[:, C] = R_BE @ (np.eye(3) + G_inv @ (R - np.eye(3)))
+    for j in range(3):  # ∂(G⁻¹ D)/∂G_jk = −G⁻¹ e_j moved_k
+        J[:, 6 + 3 * j : 9 + 3 * j] = -np.outer(R_BE @ G_inv[:, j], moved)
+    J[:, DRIFT] = phase * J[:, C]
+    # The estimate is stamped s − τ and the hand read there: a wrong τ only misplaces the in-grasp part, which the
+    # caller adds from its rate.
+    B = np.concatenate([-skew(R @ c_t + t - motions.centre[k]), np.eye(3)], axis=1)  # (3, 6)
+    L = R_BE @ G_inv @ B
+    covariance = J @ tip_map.covariance @ J.T + L @ motions.covariance[k] @ L.T + noise_m**2 * np.eye(3)
+    return Tip(p_B, covariance, D, moved)

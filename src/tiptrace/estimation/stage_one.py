@@ -1,0 +1,194 @@
+"""Stage I as it comes in: bounded memory, a running estimate, and the solve at its end."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from tiptrace.errors import GeometryError
+from tiptrace.estimation.anchor import TipPrior, covariance_from_information
+from tiptrace.estimation.motion import MotionConfig, Motions, TemplateFit
+from tiptrace.estimation.pads import PadMarkers
+from tiptrace.estimation.patch import PatchConfig, trust
+from tiptrace.estimation.pose_track import HandStates, smooth_at
+from tiptrace.estimation.tip_map import TipMap, TipMapConfig, solve_tip_map
+from tiptrace.geometry.transforms import skew
+from tiptrace.types import BoolArray, FloatArray, PoseSample
+
+
+class StageOneConfig(BaseModel):
+    """Memory and effort."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    memory_frames: int = Field(default=1500, ge=10)
+    memory_poses: int = Field(default=30000, ge=100)
+    solve_frames: int = Field(default=250, ge=10)  # more are thinned out evenly
+    template_rounds: int = Field(default=3, ge=1)
+
+
+@dataclass(frozen=True, slots=True)
+class Anchoring:
+    """What Stage I leaves for Stage II."""
+
+    tip_map: TipMap
+    fit: TemplateFit
+    trust: FloatArray
+    stamps_ns: FloatArray
+    motions: Motions
+    hand: HandStates
+    start_ns: int
+
+    @property
+    def tool_rotations(self) -> FloatArray:
+        """(T, 3, 3) rotations of the tool in F_B."""
+        return np.asarray(self.hand.T_B_E[:, :3, :3] @ self.motions.R)
+
+    def phase(self, stamp_ns: float) -> float:
+        """t/T_I − 1."""
+        return (stamp_ns - self.start_ns) * 1e-9 / self.tip_map.duration_s - 1.0
+
+
+class StageOne:
+    """Collects the anchoring segment."""
+
+    def __init__(
+        self,
+        config: StageOneConfig,
+        patch: PatchConfig,
+        motion: MotionConfig,
+        tip_map: TipMapConfig,
+        half_width_s: float,
+    ) -> None:
+        self._config, self._patch, self._motion, self._tip_map = config, patch, motion, tip_map
+        self._half_s = half_width_s
+        self._frames: deque[tuple[int, PadMarkers]] = deque(maxlen=config.memory_frames)
+        self._poses: deque[PoseSample] = deque(maxlen=config.memory_poses)
+        self._sum_S: FloatArray | None = None
+        self._seen: FloatArray | None = None
+        self._count = 0
+
+    def __len__(self) -> int:
+        return self._count
+
+    def add_poses(self, poses: tuple[PoseSample, ...]) -> None:
+        """Pose samples of the segment."""
+        last = self._poses[-1].stamp_ns if self._poses else -1
+        self._poses.extend(p for p in poses if p.stamp_ns > last)
+
+    def add(self, stamp_ns: int, markers: PadMarkers) -> None:
+        """A frame of the segment."""
+        if self._sum_S is None or self._seen is None:
+            self._sum_S, self._seen = np.zeros_like(markers.x_S), np.zeros(len(markers.x_S))
+        seen = np.isfinite(markers.x_S[:, 0])
+        self._sum_S[seen] += markers.x_S[seen]
+        self._seen[seen] += 1
+        self._frames.append((stamp_ns, markers))
+        self._count += 1
+
+    def trust(self) -> FloatArray:
+        """(N,) weight of every marker, from its mean place so far."""
+        assert self._sum_S is not None
+        assert self._seen is not None
+        with np.errstate(invalid="ignore"):
+            mean = np.where(
+                self._seen[:, None] > 0.5 * self._count, self._sum_S / self._seen[:, None], np.nan
+            )
+        pad = self._frames[-1][1].pad
+        return np.concatenate([trust(mean[pad == k], self._patch) for k in (0, 1)])
+
+    def first_fit(self) -> TemplateFit:
+        """Fit to the mean of the first frames, for the running estimate."""
+        head = [m for _, m in list(self._frames)[:5]]
+        M = _first_seen(np.stack([m.X for m in head]))
+        return TemplateFit(M, head[0].pad, head[0].axes, self.trust(), self._motion)
+
+    def solve(self, latency: tuple[float, float] | None, prior: TipPrior | None) -> Anchoring:
+        """Template, motions and tip map of the segment.
+
+        Raises:
+            GeometryError: too few frames, markers or poses.
+        """
+        stamps, fit, weights, motions = self._fit_template()
+        duration = max((stamps[-1] - stamps[0]) * 1e-9, 1e-3)
+        phase = (stamps - stamps[0]) * 1e-9 / duration - 1.0
+        good: BoolArray = np.asarray(motions.sides.min(axis=1) > 0)
+        if good.sum() < 3:
+            raise GeometryError("Stage I has fewer than 3 frames with markers on both fingers")
+        motions, kept = _select(motions, good), stamps[good]
+        track = np.array([p.stamp_ns for p in self._poses], dtype=np.float64)
+        T = np.array([p.T_B_E for p in self._poses])
+        if len(track) < 4:
+            raise GeometryError(f"Stage I has {len(track)} end-effector poses, at least 4 are needed")
+
+        def hand_at(latency_s: float) -> HandStates:
+            return smooth_at(track, T, kept - latency_s * 1e9, self._half_s)
+
+        tip_map = solve_tip_map(motions, hand_at, phase[good], duration, self._tip_map, latency, prior)
+        return Anchoring(tip_map, fit, weights, kept, motions, hand_at(tip_map.latency_s), int(stamps[0]))
+
+    def _fit_template(self) -> tuple[FloatArray, TemplateFit, FloatArray, Motions]:
+        """Template from all frames, alternating with the motions."""
+        if len(self._frames) < 3:
+            raise GeometryError(f"Stage I has {len(self._frames)} frames, at least 3 are needed")
+        step = -(-len(self._frames) // self._config.solve_frames)
+        frames = list(self._frames)[::step]
+        stamps = np.array([s for s, _ in frames], dtype=np.float64)
+        X = np.stack([m.X for _, m in frames])  # (T, N, 3)
+        first, weights = frames[0][1], self.trust()
+        M, start = _first_seen(X), None
+        for _ in range(self._config.template_rounds):
+            fit = TemplateFit(M, first.pad, first.axes, weights, self._motion)
+            motions = fit.fit(X, start)
+            M, start = fit.refined_template(X, motions), (motions.R, motions.t)
+        fit = TemplateFit(M, first.pad, first.axes, weights, self._motion)
+        return stamps, fit, weights, fit.fit(X, start)
+
+
+def _first_seen(X: FloatArray) -> FloatArray:
+    """Mean of the first frames in which each marker is seen, (T, N, 3) → (N, 3)."""
+    head = X[: max(1, min(5, len(X)))]
+    seen = np.isfinite(head[..., 0])
+    total = np.maximum(seen.sum(axis=0), 1)[:, None]
+    M = np.where(seen[..., None], head, 0.0).sum(axis=0) / total
+    return np.asarray(np.where(seen.any(axis=0)[:, None], M, np.nan))
+
+
+def _select(m: Motions, good: BoolArray) -> Motions:
+    return Motions(*(getattr(m, name)[good] for name in Motions.__slots__))
+
+
+class RunningTip:
+    """Tip so far during Stage I: 6×6 normal equations of ``T_B_E (R c + t) = p``, the gel taken at its word."""
+
+    def __init__(self, prior: TipPrior | None, sigma_m: float) -> None:
+        self._N, self._b, self._frames = np.zeros((6, 6)), np.zeros(6), 0
+        self._lever: FloatArray | None = None
+        self._sigma_m = sigma_m
+        if prior is not None:
+            self._N[:3, :3] = np.linalg.inv(prior.covariance)
+            self._b[:3] = self._N[:3, :3] @ prior.c
+
+    def add(self, motions: Motions, T_B_E: FloatArray) -> None:
+        """One frame."""
+        R_BE, t_BE = T_B_E[:3, :3], T_B_E[:3, 3]
+        lever = np.array([0.0, 0.0, 0.06]) if self._lever is None else self._lever
+        B = np.concatenate([-skew(lever), np.eye(3)], axis=1)
+        S = B @ motions.covariance[0] @ B.T + self._sigma_m**2 * np.eye(3)
+        W = R_BE @ np.linalg.inv(S) @ R_BE.T
+        A = np.concatenate([R_BE @ motions.R[0], -np.eye(3)], axis=1)
+        y = R_BE @ motions.t[0] + t_BE
+        self._N += A.T @ W @ A
+        self._b -= A.T @ W @ y
+        self._frames += 1
+
+    def solve(self) -> tuple[FloatArray, FloatArray] | None:
+        """(p, its covariance), None before there is any."""
+        if self._frames < 3:
+            return None
+        covariance = covariance_from_information(self._N)
+        theta = covariance @ self._b
+        return theta[3:], covariance[3:, 3:]

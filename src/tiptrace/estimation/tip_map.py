@@ -1,0 +1,323 @@
+"""Stage I in one solve: tip, what the gel shows of its motion, latency, grasp drift (``docs/estimation.md``, Tip map).
+
+The markers show the tip displaced against the hand by ``D_t(c) = R^E_t c + t^E_t − c``; a resting tip p enforces
+``u_t = T_B_E(s − τ)⁻¹ p − c_t``. With a 3×3 map G of what the gel shows, ``D_t(c_t) = G u_t``. Unknowns in order:
+c (3), p (3), G (9, row-major), τ (1), ċ (3). Motions are noisy in rotation and translation; each carries its own
+correction, eliminated frame by frame (Gauss-Helmert), so that noisy rotations do not bias c.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from tiptrace.estimation.anchor import TipPrior, fixed_point_ml
+from tiptrace.estimation.motion import Motions
+from tiptrace.estimation.pose_track import HandStates
+from tiptrace.estimation.robust import huber_weight
+from tiptrace.geometry.transforms import rotation_exp, skew
+from tiptrace.types import BoolArray, FloatArray
+
+C, P, G_, TAU, DRIFT = slice(0, 3), slice(3, 6), slice(6, 15), slice(15, 16), slice(16, 19)
+_SIZE = 19
+_I9 = np.eye(3).ravel()
+
+
+class TipMapConfig(BaseModel):
+    """Priors and gates."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    learn_map: bool = True
+    map_sigma: float = Field(default=0.10, gt=0)
+    map_off_diagonal_sigma: float = Field(default=0.06, gt=0)
+    map_gate_m: float = Field(default=1e-3, gt=0)  # standard deviation of the enforced motion along an axis
+    latency_s: float = 0.050  # where the rig says nothing
+    latency_std_s: float = Field(default=0.030, gt=0)
+    latency_gate_s: float = Field(default=0.010, gt=0)
+    drift_sigma_m: float = Field(default=3e-3, gt=0)
+    drift_evidence: float = Field(default=3.0, gt=0)  # sigmas
+    pose_sigma_m: float = Field(default=4e-5, gt=0)  # of the tip through the smoothed hand pose
+    model_sigma_m: float = Field(default=5e-5, gt=0)  # what a linear map leaves
+    huber: float = Field(default=2.5, gt=0)
+    iterations: int = Field(default=15, ge=3)
+
+
+@dataclass(frozen=True, slots=True)
+class TipMap:
+    """Solution of Stage I.
+
+    Attributes:
+        theta: (19,) c, p, G row-major, τ (s), ċ.
+        covariance: (19, 19); unknowns that a gate held at their prior keep its uncertainty.
+        learned: (19,) which unknowns the data determined.
+        residual_m: Root mean square of ``D_t(c_t) − G u_t``.
+        correlation: How many frames say the same (1 = independent).
+        frames: Frames used.
+        duration_s: Length T_I of Stage I.
+        residual: (T, 3) of ``D_t(c_t) − G u_t`` in F_E, m.
+    """
+
+    theta: FloatArray
+    covariance: FloatArray
+    learned: BoolArray
+    residual_m: float
+    correlation: float
+    frames: int
+    duration_s: float
+    residual: FloatArray
+
+    @property
+    def c(self) -> FloatArray:
+        """(3,) tip in F_E at the end of Stage I, m."""
+        return self.theta[C]
+
+    @property
+    def p(self) -> FloatArray:
+        """(3,) resting tip in F_B, m."""
+        return self.theta[P]
+
+    @property
+    def G(self) -> FloatArray:
+        """(3, 3) what the gel shows of a tip displacement in F_E."""
+        return self.theta[G_].reshape(3, 3)
+
+    @property
+    def latency_s(self) -> float:
+        """Capture stamp minus exposure."""
+        return float(self.theta[15])
+
+    @property
+    def drift(self) -> FloatArray:
+        """(3,) displacement of the tip in the grasp over the length of Stage I, m."""
+        return self.theta[DRIFT]
+
+
+HandAt = Callable[[float], HandStates]
+"""Latency in s → the hand at every frame's exposure."""
+
+
+def solve_tip_map(
+    motions: Motions,
+    hand_at: HandAt,
+    phase: FloatArray,
+    duration_s: float,
+    config: TipMapConfig,
+    latency: tuple[float, float] | None = None,
+    prior: TipPrior | None = None,
+) -> TipMap:
+    """Tip, map, latency and drift from Stage I.
+
+    Args:
+        motions: In-grasp motions of T frames.
+        hand_at: Hand poses of the T frames for a latency.
+        phase: (T,) t/T_I − 1: from −1 at the start of Stage I to 0 at its end.
+        duration_s: T_I.
+        config: Priors and gates.
+        latency: Calibrated (mean, std) in s, where there is one.
+        prior: Known tip in F_E.
+
+    Raises:
+        GeometryError: fewer than 3 frames.
+    """
+    solver = _Solver(
+        motions, hand_at, phase, config, latency or (config.latency_s, config.latency_std_s), prior
+    )
+    theta = solver.start()
+    free = np.ones(_SIZE, dtype=bool)
+    free[DRIFT] = False
+    free[G_] = np.tile(solver.moved(theta) > config.map_gate_m, 3) & config.learn_map
+    best = solver.solve(theta, free)
+    if latency_too_vague(best, config):
+        free[TAU] = False
+        best = solver.solve(theta, free)
+    drifting = free.copy()
+    drifting[DRIFT] = True
+    candidate = solver.solve(best.theta, drifting)
+    sigma = np.sqrt(np.diag(candidate.covariance)[DRIFT])
+    if np.any(np.abs(candidate.drift) > config.drift_evidence * sigma):
+        best = candidate
+    return TipMap(
+        best.theta, best.covariance, best.learned, best.rms, best.factor, len(phase), duration_s, best.r
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Solution:
+    theta: FloatArray
+    covariance: FloatArray
+    learned: BoolArray
+    rms: float
+    factor: float
+    r: FloatArray
+
+    @property
+    def drift(self) -> FloatArray:
+        return self.theta[DRIFT]
+
+
+def latency_too_vague(solution: _Solution, config: TipMapConfig) -> bool:
+    """Whether τ must stay at its calibrated value."""
+    return bool(np.sqrt(solution.covariance[15, 15]) > config.latency_gate_s)
+
+
+class _Solver:
+    def __init__(
+        self,
+        motions: Motions,
+        hand_at: HandAt,
+        phase: FloatArray,
+        config: TipMapConfig,
+        latency: tuple[float, float],
+        prior: TipPrior | None,
+    ) -> None:
+        self._m, self._hand_at, self._phase, self._config = motions, hand_at, phase, config
+        self._latency, self._prior = latency, prior
+        self._mean = np.concatenate([np.zeros(6), _I9, [latency[0]], np.zeros(3)])
+        off = config.map_off_diagonal_sigma
+        sigma_G = np.where(np.eye(3) > 0, config.map_sigma, off).ravel()
+        self._sigma = np.concatenate(
+            [np.full(6, np.inf), sigma_G, [latency[1]], np.full(3, config.drift_sigma_m)]
+        )
+        self._prior_N = np.diag(self._sigma**-2)
+        if prior is not None:
+            self._mean[C] = prior.c
+            self._prior_N[C, C] = np.linalg.inv(prior.covariance)
+
+    def start(self) -> FloatArray:
+        """Maximum likelihood with the gel taken at its word and the latency at its prior."""
+        T = self._hand_at(self._latency[0]).T_B_E
+        R_BE = T[:, :3, :3]
+        rotate = np.zeros((len(T), 6, 6))
+        rotate[:, :3, :3] = rotate[:, 3:, 3:] = R_BE
+        t = np.einsum("tij,tj->ti", R_BE, self._m.t) + T[:, :3, 3]
+        centre = np.einsum("tij,tj->ti", R_BE, self._m.centre) + T[:, :3, 3]
+        Sigma = rotate @ self._m.covariance @ np.swapaxes(rotate, 1, 2)
+        Sigma[:, range(3, 6), range(3, 6)] += self._config.pose_sigma_m**2 + self._config.model_sigma_m**2
+        point = fixed_point_ml(R_BE @ self._m.R, t, Sigma, centre, prior=self._prior)
+        theta = self._mean.copy()
+        theta[C], theta[P] = point.c, point.p
+        return theta
+
+    def moved(self, theta: FloatArray) -> FloatArray:
+        """Standard deviation of the enforced motion along each axis of F_E, (3,) m."""
+        T = self._hand_at(float(theta[15])).T_B_E
+        u = np.einsum("tji,tj->ti", T[:, :3, :3], theta[P] - T[:, :3, 3])
+        return np.asarray(u.std(axis=0))
+
+    def solve(self, theta: FloatArray, free: BoolArray) -> _Solution:
+        """Gauss-Helmert iterations over the free unknowns; the others stay at their prior."""
+        theta = np.where(free, theta, self._mean)
+        k = np.zeros((len(self._phase), 3))
+        delta = np.zeros((len(self._phase), 6))
+        weights = np.ones(len(self._phase))
+        index = np.flatnonzero(free)
+        for _ in range(self._config.iterations):
+            A, S_inv, w, lever = self._linearise(theta, delta)
+            WA = weights[:, None, None] * (S_inv @ A)
+            N = np.einsum("tij,tik->jk", A, WA, optimize=True) + self._prior_N
+            b = -np.einsum("tij,ti->j", WA, w) + self._prior_N @ (self._mean - theta)
+            N_ff = N[np.ix_(index, index)]
+            step = np.zeros(_SIZE)
+            step[index] = np.linalg.solve(N_ff + 1e-12 * np.diag(np.diag(N_ff)), b[index])
+            misfit = w + A @ step
+            k = np.einsum("tij,tj->ti", S_inv, misfit)
+            length = np.sqrt(np.maximum(np.einsum("ti,ti->t", misfit, k), 0.0))
+            weights = huber_weight(length, self._config.huber * max(1.0, float(np.median(length)) / 1.54))
+            delta = -np.einsum(
+                "tij,tj->ti", self._m.covariance, np.concatenate([np.cross(lever, k), k], axis=1)
+            )
+            theta = theta + step
+            if np.abs(step[:6]).max() < 1e-7:
+                break
+        return self._finish(theta, free, delta, weights)
+
+    def _linearise(
+        self, theta: FloatArray, delta: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """A (T, 3, 19), S⁻¹ (T, 3, 3), misclosure (T, 3), lever (T, 3) at the corrected motions."""
+        m, T = self._m, len(self._phase)
+        p, G, tau = theta[P], theta[G_].reshape(3, 3), float(theta[15])
+        c_t = theta[C] + self._phase[:, None] * theta[DRIFT]  # (T, 3)
+        hand = self._hand_at(tau)
+        R_BE, t_BE = hand.T_B_E[:, :3, :3], hand.T_B_E[:, :3, 3]
+        q = np.einsum("tji,tj->ti", R_BE, p - t_BE)  # resting tip in F_E
+        u = q - c_t
+        du_ds = -np.cross(hand.rate_E, q) - np.einsum("tji,tj->ti", R_BE, hand.velocity_B)
+        E = rotation_exp(delta[:, :3])
+        R = E @ m.R
+        lever_0 = np.einsum("tij,tj->ti", m.R, c_t) + m.t - m.centre
+        lever = np.einsum("tij,tj->ti", E, lever_0)
+        y = lever + m.centre + delta[:, 3:]
+        B = np.concatenate([-skew(lever), np.broadcast_to(np.eye(3), (T, 3, 3))], axis=2)
+        S = B @ m.covariance @ np.swapaxes(B, 1, 2)
+        S[:, range(3), range(3)] += self._config.pose_sigma_m**2 + self._config.model_sigma_m**2
+        A = np.zeros((T, 3, _SIZE))
+        A[:, :, C] = R - np.eye(3) + G
+        A[:, :, P] = -G @ np.swapaxes(R_BE, 1, 2)
+        for j in range(3):
+            A[:, j, 6 + 3 * j : 9 + 3 * j] = -u
+        A[:, :, 15] = du_ds @ G.T
+        A[:, :, DRIFT] = self._phase[:, None, None] * A[:, :, C]
+        r = y - c_t - u @ G.T
+        return A, np.linalg.inv(S), r - np.einsum("tij,tj->ti", B, delta), lever
+
+    def _finish(
+        self, theta: FloatArray, free: BoolArray, delta: FloatArray, weights: FloatArray
+    ) -> _Solution:
+        """Covariance with correlated residuals, rotation noise not counted as motion, gates' priors kept."""
+        A, S_inv, _, _ = self._linearise(theta, delta)
+        r = self._linearise(theta, np.zeros_like(delta))[2]
+        factor = _inflation(r, S_inv)
+        N = np.einsum("tij,tik->jk", A, weights[:, None, None] * (S_inv @ A), optimize=True) / factor
+        N[C, C] -= self._spurious(S_inv, weights) / factor
+        N += self._prior_N
+        f, h = np.flatnonzero(free), np.flatnonzero(~free & np.isfinite(self._sigma))
+        h = h[h < 16]  # a drift that no evidence speaks for is not considered
+        P_ff = _scaled_inverse(N[np.ix_(f, f)])
+        covariance = np.zeros((_SIZE, _SIZE))
+        covariance[np.ix_(f, f)] = P_ff
+        if len(h):
+            K = -P_ff @ N[np.ix_(f, h)]
+            P_h = np.diag(self._sigma[h] ** 2)
+            covariance[np.ix_(f, f)] += K @ P_h @ K.T
+            covariance[np.ix_(f, h)] = K @ P_h
+            covariance[np.ix_(h, f)] = P_h @ K.T
+            covariance[np.ix_(h, h)] = P_h
+        rms = float(np.sqrt(np.mean(np.sum(r * r, axis=1))))
+        return _Solution(theta, covariance, free, rms, factor, r)
+
+    def _spurious(self, S_inv: FloatArray, weights: FloatArray) -> FloatArray:
+        """Information on c that mere rotation noise seems to carry, (3, 3)."""
+        K = skew(np.eye(3))
+        E = np.einsum("tmn,mki,tkl,nlj->tij", self._m.covariance[:, :3, :3], K, S_inv, K, optimize=True)
+        return np.asarray(np.einsum("t,tki,tkl,tlj->ij", weights, self._m.R, E, self._m.R, optimize=True))
+
+
+def _scaled_inverse(N: FloatArray) -> FloatArray:
+    """Inverse of an information matrix over unlike units, by scaling to a unit diagonal."""
+    s = 1.0 / np.sqrt(np.maximum(np.diag(N), 1e-12))
+    values, vectors = np.linalg.eigh(N * np.outer(s, s))
+    values = np.maximum(values, 1e-9)
+    return np.asarray(np.outer(s, s) * ((vectors / values) @ vectors.T))
+
+
+def _inflation(r: FloatArray, S_inv: FloatArray) -> float:
+    """How much less the frames say than independent frames of the assumed noise would, ≥ 1.
+
+    Variance of the whitened residuals times the sum of their autocorrelation (Bartlett window), (T, 3) → 1.
+    """
+    L = np.linalg.cholesky(S_inv + 1e-9 * np.eye(3))
+    z = np.einsum("tji,tj->ti", L, r)  # (T, 3)
+    z = z - z.mean(axis=0)
+    T = len(z)
+    variance = float(np.mean(z * z))
+    if T < 8 or variance < 1e-12:
+        return 1.0
+    reach = max(2, T // 5)
+    lags = [float(np.mean(z[k:] * z[:-k])) * (T - k) / T / variance for k in range(1, reach)]
+    correlation = 1.0 + 2.0 * sum((1.0 - k / reach) * rho for k, rho in enumerate(lags, start=1))
+    return max(1.0, variance * max(correlation, 1.0))
