@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 
 from tiptrace.errors import OutputError
+from tiptrace.evaluation.atomic import write_atomic
 from tiptrace.evaluation.metrics import evaluate
 from tiptrace.evaluation.quality import Quality, assess
 from tiptrace.geometry.transforms import rotation_exp
-from tiptrace.outputs import COLUMNS, read_csv, read_results, write_atomic, write_results
+from tiptrace.outputs import COLUMNS, read_csv, read_results, write_results
 from tiptrace.types import Anchor, Event, Phase, Status, TipEstimate, TipTrajectory
 
 from .evaluation.builders import straight_truth, trajectory_of, truth_of
@@ -134,7 +135,7 @@ def test_a_write_that_fails_leaves_the_old_file_and_no_litter(
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "replace", refuse)
-    with pytest.raises(OSError, match="No space"):
+    with pytest.raises(OutputError, match="No space"):
         write_atomic(target, "new")
     assert target.read_text() == "old"
     assert [f.name for f in tmp_path.iterdir()] == ["a.txt"]

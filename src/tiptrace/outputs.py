@@ -17,8 +17,6 @@ import csv
 import io
 import json
 import math
-import os
-import tempfile
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict
 from pathlib import Path
@@ -27,6 +25,7 @@ from typing import Any
 import numpy as np
 
 from tiptrace.errors import GeometryError, OutputError
+from tiptrace.evaluation.atomic import write_atomic
 from tiptrace.evaluation.metrics import TrialMetrics
 from tiptrace.evaluation.quality import Quality
 from tiptrace.geometry.transforms import quaternion_from_rotation, rotation_from_quaternion
@@ -50,31 +49,11 @@ def write_results(
     Raises:
         OutputError: the folder or a file cannot be written.
     """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        write_atomic(folder / TUM, tum_text(trajectory.estimates))
-        write_atomic(folder / CSV, csv_text(trajectory.estimates))
-        write_atomic(folder / EVENTS, json.dumps([asdict(e) for e in trajectory.events], indent=1) + "\n")
-        record = metrics_record(method, trajectory.anchor, metrics, quality)
-        write_atomic(folder / METRICS, json.dumps(record, indent=1, allow_nan=False) + "\n")
-    except OSError as error:
-        raise OutputError(f"{error.filename or folder}: cannot be written ({error.strerror})") from None
-
-
-def write_atomic(path: Path, content: str | bytes) -> None:
-    """Write a file so that it appears whole or not at all."""
-    data = content.encode() if isinstance(content, str) else content
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(data)
-        umask = os.umask(0)
-        os.umask(umask)
-        os.chmod(temporary, 0o666 & ~umask)  # mkstemp makes files private
-        os.replace(temporary, path)
-    except BaseException:
-        os.unlink(temporary)
-        raise
+    write_atomic(folder / TUM, tum_text(trajectory.estimates))
+    write_atomic(folder / CSV, csv_text(trajectory.estimates))
+    write_atomic(folder / EVENTS, json.dumps([asdict(e) for e in trajectory.events], indent=1) + "\n")
+    record = metrics_record(method, trajectory.anchor, metrics, quality)
+    write_atomic(folder / METRICS, json.dumps(record, indent=1, allow_nan=False) + "\n")
 
 
 def tum_text(estimates: Iterable[TipEstimate]) -> str:
