@@ -23,7 +23,7 @@ from mcap.records import Attachment, Channel, Chunk, McapRecord, Message, Schema
 from mcap.stream_reader import breakup_chunk
 
 from tiptrace.errors import RecordingError
-from tiptrace.streams.sources import RawMessage
+from tiptrace.streams.raw_messages import RawMessage
 from tiptrace.streams.topics import NS
 
 T = TypeVar("T")
@@ -142,15 +142,20 @@ class McapSource:
             ) from None
 
     def _decoder_for(self, schema: Schema) -> Callable[[bytes], Any]:
+        """By the definition in the file, or where that is none that can be read, by ROS 2's own of that name."""
         from mcap_ros2.decoder import DecoderFactory
 
         if self._factory is None:
             self._factory = DecoderFactory()
-        decoder = self._factory.decoder_for("cdr", schema)
+        decoder: Callable[[bytes], Any] | None = self._factory.decoder_for("cdr", schema)
         if decoder is None:
-            raise ValueError(f"schema encoding {schema.encoding!r}, expected ros2msg")
-        found: Callable[[bytes], Any] = decoder
-        return found
+            from rosbags.typesys import Stores, get_typestore
+
+            store, name = get_typestore(Stores.ROS2_JAZZY), schema.name
+            if name not in store.types:
+                raise ValueError(f"definition in {schema.encoding!r}, expected ros2msg")
+            return lambda data: store.deserialize_cdr(data, name)
+        return decoder
 
     # --- one pass over the record frames -------------------------------------------------------------------
 

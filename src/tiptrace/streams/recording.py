@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -54,6 +54,7 @@ class Recording:
             headers' if the two agree within a second.
         rig: In place of the attached ``rig.yaml``.
         tool: In place of the attached ``tool.yaml``.
+        references: In place of the attached images of the untouched gels.
 
     Raises:
         RecordingError: cannot be read, or lacks what a trial needs.
@@ -61,14 +62,20 @@ class Recording:
     """
 
     def __init__(
-        self, path: Path, *, stamps: Stamps = "auto", rig: Rig | None = None, tool: Tool | None = None
+        self,
+        path: Path,
+        *,
+        stamps: Stamps = "auto",
+        rig: Rig | None = None,
+        tool: Tool | None = None,
+        references: Mapping[Side, Image] | None = None,
     ) -> None:
         self.path = path
         self._source = McapSource(path)
         self._rig = rig or self._read_rig()
         self._tool = tool or self._read_tool()
         self._reader = TrialReader(self._source, STANDARD_TOPICS, self._rig, stamps, remedy=_REMEDY)
-        self._references = self._read_references()
+        self._references = self._read_references(references or {})
 
     def __iter__(self) -> Iterator[Sample]:
         """Samples in log-time order, images decoded one by one; the truth is not among them."""
@@ -133,13 +140,16 @@ class Recording:
         data = self._source.attachments.get(TOOL_FILE)
         return None if data is None else parse_yaml(Tool, data, f"{self.path}: {TOOL_FILE}")
 
-    def _read_references(self) -> dict[Side, Image]:
+    def _read_references(self, given: Mapping[Side, Image]) -> dict[Side, Image]:
         found: dict[Side, Image] = {}
         for side in SIDES:
             name = REFERENCE_FILE[side]
-            if name in self._source.attachments:
-                where = f"{self.path}: {name}"
+            where = f"{self.path}: {name}"
+            if side in given:
+                found[side], where = given[side], f"{side} reference"
+            elif name in self._source.attachments:
                 found[side] = decode_reference(self._source.attachments[name], where)
+            if side in found:
                 check_reference(found[side], self._rig, side, where)
         return found
 

@@ -10,7 +10,7 @@ from tiptrace.config import Rig
 from tiptrace.errors import RecordingError
 from tiptrace.streams import messages
 from tiptrace.streams.messages import MessageError
-from tiptrace.streams.sources import MessageSource, RawMessage
+from tiptrace.streams.raw_messages import MessageSource, RawMessage
 from tiptrace.streams.topics import NS
 from tiptrace.types import (
     SIDES,

@@ -1,85 +1,78 @@
-"""Messages as stored, before anything is made of them; one interface over MCAP files and rosbag2 folders."""
+"""Opens a recording of any origin from what a user gives on the command line."""
 
 from __future__ import annotations
 
-import struct
-from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
 
-from tiptrace.streams.topics import NS
+from tiptrace.config import Rig, Tool, load_yaml
+from tiptrace.errors import ConfigError, RecordingError
+from tiptrace.streams.foreign import ForeignRecording
+from tiptrace.streams.mapping import MapFile, parse_frame_range
+from tiptrace.streams.recording import Recording, decode_reference
+from tiptrace.streams.topics import Stamps
+from tiptrace.types import Image, Side
 
 
-@dataclass(frozen=True, slots=True)
-class RawMessage:
-    """One message, still serialised.
+def open_recording(
+    path: Path,
+    *,
+    map_file: Path | None = None,
+    rig: Path | None = None,
+    tool: Path | None = None,
+    reference_left: Path | None = None,
+    reference_right: Path | None = None,
+    reference_frames: str | None = None,
+    stamps: Stamps = "auto",
+) -> Recording | ForeignRecording:
+    """A recording in tiptrace's format, or with a map file anybody's.
 
-    Attributes:
-        topic: Topic name.
-        type: ROS 2 type, e.g. ``geometry_msgs/msg/PoseStamped``.
-        log_time_ns: When the recorder received it.
-        data: CDR bytes, with their encapsulation header.
-        schema: Handle by which the source finds the decoder.
+    Args:
+        path: MCAP file, rosbag2 folder or ``.db3`` file.
+        map_file: ``map.yaml``; needs ``rig``. Without it the file must be in the recording format.
+        rig: ``rig.yaml``, in place of the attached one.
+        tool: ``tool.yaml``, in place of the attached one.
+        reference_left: Image of the untouched left gel, in place of the attached one.
+        reference_right: Image of the untouched right gel.
+        reference_frames: ``0:20``: the mean of these frames is the reference (with a map file).
+        stamps: Which clock dates the messages.
+
+    Raises:
+        RecordingError: cannot be read, or lacks what a trial needs.
+        ConfigError: a settings file is wrong, or arguments do not go together.
     """
-
-    topic: str
-    type: str
-    log_time_ns: int
-    data: bytes
-    schema: Any
-
-
-class MessageSource(Protocol):
-    """A file or folder of ROS 2 messages that can be read several times."""
-
-    @property
-    def path(self) -> Path:
-        """Where it lies."""
-        ...
-
-    @property
-    def damage(self) -> str | None:
-        """Why reading stopped early, once a pass has found out."""
-        ...
-
-    def messages(self) -> Iterator[RawMessage]:
-        """All messages in log-time order; ends early at damage, never raises for it."""
-        ...
-
-    def decode(self, message: RawMessage) -> Any:
-        """The message as an object with ROS field names.
-
-        Raises:
-            RecordingError: the bytes do not fit the type.
-        """
-        ...
+    rig_model = load_yaml(Rig, rig) if rig is not None else None
+    tool_model = load_yaml(Tool, tool) if tool is not None else None
+    given: dict[Side, Path | None] = {"left": reference_left, "right": reference_right}
+    references = {side: _load_image(p) for side, p in given.items() if p is not None}
+    if map_file is None:
+        if reference_frames is not None:
+            raise ConfigError(
+                "reference frames need a map file; a recording in tiptrace's format has references"
+            )
+        if path.is_dir() or path.suffix == ".db3":
+            raise RecordingError(
+                f"{path}: is not in tiptrace's format; read it with a map and a rig file: "
+                f"tiptrace inspect {path} --write-map map.yaml, then --map map.yaml --rig rig.yaml"
+            )
+        return Recording(path, stamps=stamps, rig=rig_model, tool=tool_model, references=references)
+    if rig_model is None:
+        raise ConfigError(
+            f"{map_file}: a recording read with a map file needs a rig file too: --rig rig.yaml"
+        )
+    return ForeignRecording(
+        path,
+        load_yaml(MapFile, map_file),
+        rig_model,
+        tool=tool_model,
+        references=references,
+        reference_frames=parse_frame_range(reference_frames) if reference_frames is not None else None,
+        stamps=stamps,
+    )
 
 
-_HEADED = {  # types that begin with std_msgs/Header
-    "sensor_msgs/msg/CompressedImage",
-    "sensor_msgs/msg/Image",
-    "sensor_msgs/msg/PointCloud2",
-    "geometry_msgs/msg/PoseStamped",
-    "geometry_msgs/msg/PointStamped",
-    "geometry_msgs/msg/TransformStamped",
-}
-
-
-@dataclass(frozen=True, slots=True)
-class HeaderPeek:
-    """``std_msgs/Header`` read without decoding the rest of the message."""
-
-    stamp_ns: int
-    frame_id: str
-
-
-def peek_header(message: RawMessage) -> HeaderPeek | None:
-    """Header of a message whose type begins with one; None for other types and for bytes too short."""
-    data = message.data
-    if message.type not in _HEADED or len(data) < 16:
-        return None
-    order = "<" if data[1] & 1 else ">"
-    sec, nanosec, length = struct.unpack_from(order + "iII", data, 4)
-    frame_id = bytes(data[16 : 16 + max(length - 1, 0)]).decode("utf-8", errors="replace")
-    return HeaderPeek(sec * NS + nanosec, frame_id)
+def _load_image(path: Path) -> Image:
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be read ({error.strerror})") from None
+    return decode_reference(data, str(path))

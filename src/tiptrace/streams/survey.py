@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from tiptrace.streams.sources import MessageSource, RawMessage, peek_header
+from tiptrace.streams.raw_messages import MessageSource, RawMessage, peek_header
 from tiptrace.streams.topics import NS
 
 Stamps_ns = NDArray[np.int64]

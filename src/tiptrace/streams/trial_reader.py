@@ -10,8 +10,8 @@ from tiptrace.config import Rig
 from tiptrace.errors import RecordingError
 from tiptrace.geometry.transforms import quaternion_from_rotation
 from tiptrace.streams import checks
+from tiptrace.streams.raw_messages import MessageSource, RawMessage, peek_header
 from tiptrace.streams.sample_reader import ImageStep, SampleReader, TrialTopics
-from tiptrace.streams.sources import MessageSource, RawMessage, peek_header
 from tiptrace.streams.survey import Stamps_ns, survey
 from tiptrace.streams.topics import NS, Stamps
 from tiptrace.types import (
