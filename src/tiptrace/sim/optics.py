@@ -68,33 +68,45 @@ def untouched_colour(optics: Optics, x_m: FloatArray, y_m: FloatArray) -> FloatA
 def irradiance(
     optics: Optics,
     channel: int,
-    slope_x: Float32Array,
-    slope_y: Float32Array,
-    at_x: FloatArray,
-    at_y: FloatArray,
-) -> Float32Array:
+    slope_x: FloatArray | Float32Array,
+    slope_y: FloatArray | Float32Array,
+    x_m: FloatArray,
+    y_m: FloatArray,
+    precision: type[np.floating] = np.float32,
+) -> Any:
     """E_c for surface slopes ∂z/∂x, ∂z/∂y at places in metres; the arrays broadcast.
 
     The camera looks along +z_S at the back of the coating, so that the normal it sees is
     (∂z/∂x, ∂z/∂y, −1) turned towards it: n ∝ (z_x, z_y, 1) in axes with z flipped.
     """
     inverse = 1 / np.sqrt(1 + slope_x**2 + slope_y**2)
-    soft2 = np.float32(optics.softness[channel] ** 2)
-    E = np.full(
-        np.broadcast_shapes(slope_x.shape, at_x.shape, at_y.shape), optics.ambient[channel], np.float32
-    )
-    turn_x, turn_y = (np.asarray(v / optics.lamp_distance_m, np.float32) for v in (at_x, at_y))
+    soft2 = precision(optics.softness[channel] ** 2)
+    shape = np.broadcast_shapes(slope_x.shape, x_m.shape, y_m.shape)
+    E = np.full(shape, optics.ambient[channel], precision)
+    turn_x, turn_y = (np.asarray(v / optics.lamp_distance_m, precision) for v in (x_m, y_m))
     for toward, strength in zip(optics.lamp_toward[channel], optics.lamp_strength[channel], strict=True):
-        lx, ly, lz = toward.astype(np.float32)
+        lx, ly, lz = toward.astype(precision)
         facing = ((lx - turn_x) * slope_x + (ly - turn_y) * slope_y + lz) * inverse
-        E += np.float32(0.5 * strength) * (facing + np.sqrt(facing * facing + soft2))
+        E += precision(0.5 * strength) * (facing + np.sqrt(facing * facing + soft2))
     return E
 
 
-def nominal_optics() -> Optics:
-    """The gel that was fitted to real images."""
+def fitted_data() -> dict[str, Any]:
+    """What ``scripts/fit_optics.py`` found."""
     text = (resources.files("tiptrace.sim") / "data" / "optics.json").read_text(encoding="utf-8")
-    return optics_from_dict(json.loads(text))
+    data: dict[str, Any] = json.loads(text)
+    return data
+
+
+def nominal_optics() -> Optics:
+    """The marker gel that was fitted to real images."""
+    return optics_from_dict(fitted_data())
+
+
+def press_optics() -> Optics:
+    """The gel without markers on which the real presses were made: the same lamps, its own colour."""
+    data = fitted_data()
+    return optics_from_dict(data | {"background": data["background_presses"]})
 
 
 def optics_from_dict(data: dict[str, Any]) -> Optics:
