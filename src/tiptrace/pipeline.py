@@ -3,29 +3,49 @@
 from __future__ import annotations
 
 import time
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 from tiptrace.errors import RecordingError
 from tiptrace.streams.sync_report import SyncReport
 from tiptrace.streams.synchronise import synchronise
 from tiptrace.tracer import TipTracer, make_tracer
-from tiptrace.types import Observation, Phase, Stream, TipEstimate, TipTrajectory
+from tiptrace.types import Observation, Phase, SensedPair, Stream, TipEstimate, TipTrajectory
+
+STEPS = ("acquire", "sense", "estimate")
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One turn of the loop, for whoever watches.
+
+    Attributes:
+        observation: The synchronised pair.
+        sensed: Its markers.
+        estimate: What was made of them.
+        times_ms: (3,) acquire (or decode and pair), sense, estimate.
+    """
+
+    observation: Observation
+    sensed: SensedPair
+    estimate: TipEstimate
+    times_ms: tuple[float, float, float]
 
 
 class Viewer(Protocol):
-    """Something that watches the loop."""
+    """Something that watches the loop; its time is not counted."""
 
-    def show(self, observation: Observation, estimate: TipEstimate) -> None:
-        """See a pair and what was made of it."""
+    def show(self, step: Step) -> None:
+        """See what was made of a pair."""
         ...
 
 
 class NullViewer:
     """Watches nothing."""
 
-    def show(self, observation: Observation, estimate: TipEstimate) -> None:
+    def show(self, step: Step) -> None:
         """Do nothing."""
 
 
@@ -37,41 +57,66 @@ def trace(
     Args:
         stream: Where samples come from.
         tracer: The method.
-        viewer: Watches; its time is not counted.
+        viewer: Watches.
         report: Collects what synchronisation dropped and why.
 
     Returns:
         An estimate for every pair, in order; ``loop_ms`` includes acquisition or decoding.
 
     Raises:
-        RecordingError: no pair at all, or no phase marks.
+        RecordingError: no pair at all, or no anchoring frames.
     """
-    viewer = viewer or NullViewer()
+    viewer, report = viewer or NullViewer(), report or SyncReport()
     trajectory = TipTrajectory()
-    start = time.perf_counter()
-    for observation in synchronise(stream, report=report):
-        estimate = tracer.update(observation)
-        estimate = replace(estimate, loop_ms=(time.perf_counter() - start) * 1e3)
-        trajectory.append(estimate)
-        viewer.show(observation, estimate)
+    for observation, acquired_ms in _timed(synchronise(stream, report=report)):
         start = time.perf_counter()
-    trajectory.anchor = tracer.anchor
-    trajectory.events = list(tracer.events)
-    _check(trajectory)
+        sensed = tracer.sensing(observation)
+        middle = time.perf_counter()
+        estimate = tracer.estimator.update(sensed)
+        end = time.perf_counter()
+        times_ms = (acquired_ms, (middle - start) * 1e3, (end - middle) * 1e3)
+        estimate = replace(estimate, loop_ms=sum(times_ms))
+        trajectory.append(estimate)
+        viewer.show(Step(observation, sensed, estimate, times_ms))
+    _finish(trajectory, tracer)
+    trajectory.events = sorted([*trajectory.events, *report.gaps], key=lambda event: event.start_ns)
     return trajectory
 
 
-def trace_method(
-    stream: Stream, method: str, viewer: Viewer | None = None, report: SyncReport | None = None
-) -> tuple[TipTrajectory, TipTracer]:
-    """Run a method over a stream with one thread per finger; also returns the tracer with its last state."""
+def replay(pairs: Iterable[SensedPair], tracer: TipTracer) -> TipTrajectory:
+    """Run another estimator over markers already sensed, without ``loop_ms``."""
+    trajectory = TipTrajectory([tracer.estimator.update(pair) for pair in pairs])
+    return _finish(trajectory, tracer)
+
+
+@contextmanager
+def open_tracer(stream: Stream, method: str) -> Iterator[TipTracer]:
+    """A tracer with one thread per finger.
+
+    Raises:
+        ConfigError: an unknown method; the valid ones are listed.
+    """
+    from concurrent.futures import ThreadPoolExecutor
+
     with ThreadPoolExecutor(max_workers=2, thread_name_prefix="finger") as pool:
-        tracer = make_tracer(stream, method, both=pool.map)
-        return trace(stream, tracer, viewer, report), tracer
+        yield make_tracer(stream, method, both=pool.map)
 
 
-def _check(trajectory: TipTrajectory) -> None:
-    """Refuse what would otherwise end as an empty table without a word."""
+def _timed(observations: Iterator[Observation]) -> Iterator[tuple[Observation, float]]:
+    """Each observation with the time that it took to come, ms."""
+    while True:
+        start = time.perf_counter()
+        try:
+            observation = next(observations)
+        except StopIteration:
+            return
+        yield observation, (time.perf_counter() - start) * 1e3
+
+
+def _finish(trajectory: TipTrajectory, tracer: TipTracer) -> TipTrajectory:
+    """Anchor and events; refuse what would otherwise end as an empty table without a word."""
+    trajectory.anchor = tracer.anchor
+    trajectory.events = list(tracer.events)
     if not trajectory.estimates:
         raise RecordingError(
             "no pair of left and right images with an end-effector pose: the streams do not overlap in time, or "
@@ -85,3 +130,4 @@ def _check(trajectory: TipTrajectory) -> None:
         )
     if Phase.ANCHORING not in phases:
         raise RecordingError("no anchoring frames: no image pair falls into the phase 'anchoring'")
+    return trajectory

@@ -10,6 +10,9 @@ from rich.markup import escape
 
 import tiptrace
 from tiptrace.cli.calibrate_tip import calibrate_tip
+from tiptrace.cli.demo import demo
+from tiptrace.cli.reconstruct import reconstruct
+from tiptrace.cli.simulate import simulate
 from tiptrace.errors import TipTraceError
 
 app = typer.Typer(
@@ -21,6 +24,9 @@ app = typer.Typer(
 calibrate = typer.Typer(help="What is measured once: gel, tip, rig.", no_args_is_help=True)
 app.add_typer(calibrate, name="calibrate")
 
+app.command()(demo)
+app.command()(simulate)
+app.command()(reconstruct)
 calibrate.command("tip")(calibrate_tip)
 
 

@@ -6,6 +6,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from tiptrace.errors import GeometryError, PerceptionError
+from tiptrace.estimation.arrangement import ArrangementCheck
 from tiptrace.geometry.fixed_point import FixedPointAccumulator
 from tiptrace.geometry.kabsch import RigidMotion, kabsch
 from tiptrace.geometry.transforms import apply
@@ -48,7 +49,9 @@ class PaperEstimator:
         self._X_0: FloatArray | None = None  # (N, 3) base frame, frame 0
         self._R_B_E_0: FloatArray = np.eye(3)
         self._fixed_point = FixedPointAccumulator()
+        self._arrangement: ArrangementCheck | None = ArrangementCheck()
         self._anchor: Anchor | None = None
+        self.motion: RigidMotion | None = None  # (R_t, d_t) of the latest pair
         self.events: list[Event] = []
 
     @property
@@ -66,15 +69,18 @@ class PaperEstimator:
 
         Raises:
             PerceptionError: the grasp is not closed at frame 0.
-            GeometryError: reconstruction begins without a single anchoring frame.
+            GeometryError: reconstruction begins without a single anchoring frame, or Stage I shows that an image
+                is mirrored or that left and right are exchanged.
         """
         if self._X_0 is None and not self._initialise(pair):
             return TipEstimate(pair.stamp_ns, pair.phase, Status.LOST)
         motion, markers = self._motion_from_frame_0(pair)  # (R_t, d_t)
+        self.motion = motion
 
         if pair.phase is Phase.ANCHORING:  # Stage I
             if motion is not None:
                 self._fixed_point.add(motion.R, motion.d)
+            self._check_arrangement(pair)
             p_0 = self._solve_anchor()
             return self._estimate(pair, motion, markers, p_0, Status.ANCHORING)
         if pair.phase is None:
@@ -85,6 +91,9 @@ class PaperEstimator:
                 "reconstruction begins without any anchoring frame: the trial needs a segment marked 'anchoring' "
                 "in which the hand moves while the tip rests"
             )
+        if self._arrangement is not None:
+            self._arrangement.verify()
+            self._arrangement = None
         if self._anchor is None:
             self._refuse(pair)
             return TipEstimate(pair.stamp_ns, pair.phase, Status.UNOBSERVABLE, markers=markers)
@@ -123,6 +132,17 @@ class PaperEstimator:
             x.append(apply(finger.T_B_E @ finger.T_E_S, finger.markers.x_S[rows]))  # ᴮT_E ᴱT_S x_S
             seen.append(finger.markers.tracked[rows])
         return np.concatenate(x), np.concatenate(seen)
+
+    def _check_arrangement(self, pair: SensedPair) -> None:
+        if self._arrangement is None:
+            return
+        x_S: dict[Side, FloatArray] = {}
+        T_B_S: dict[Side, FloatArray] = {}
+        for side in SIDES:
+            finger = pair.finger(side)
+            x_S[side] = finger.markers.x_S[self._chosen[side]]
+            T_B_S[side] = finger.T_B_E @ finger.T_E_S
+        self._arrangement.add(x_S, T_B_S)
 
     def _motion_from_frame_0(self, pair: SensedPair) -> tuple[RigidMotion | None, int]:
         """(R_t, d_t) by Kabsch over the markers still seen; None if they are too few or collinear."""

@@ -1,0 +1,227 @@
+"""From one recording to its results folder: trajectories, metrics and the report."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+import tiptrace
+from tiptrace.estimation.paper import PaperEstimator
+from tiptrace.evaluation.metrics import TrialMetrics, evaluate
+from tiptrace.evaluation.quality import Quality, assess
+from tiptrace.evaluation.report_data import AnchoringFit, MethodResult, ReportData, TactileView
+from tiptrace.evaluation.trial_report import write_trial_report
+from tiptrace.evaluation.truth import Truth
+from tiptrace.outputs import write_results
+from tiptrace.pipeline import STEPS, Step, open_tracer, replay, trace
+from tiptrace.streams.sync_report import SyncReport
+from tiptrace.tracer import TipTracer, make_tracer
+from tiptrace.types import SIDES, FloatArray, ImageSample, Phase, SensedPair, Side, Stream, TruthSample
+
+
+class Trial(Stream, Protocol):
+    """A stream with what only evaluation and reports may see."""
+
+    @property
+    def trial(self) -> dict[str, Any]:
+        """Free metadata."""
+        ...
+
+    @property
+    def notes(self) -> list[str]:
+        """How far the recording could be used."""
+        ...
+
+    def truth(self) -> list[TruthSample]:
+        """The true tip, empty where nobody knows it."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Reconstruction:
+    """What came out of a recording.
+
+    Attributes:
+        methods: Results, the asked one first.
+        metrics: Of the asked method.
+        quality: Of the asked method, judged without ground truth.
+        truth: True tip, where the recording has it.
+        report: The page; None where none was asked for.
+        notes: Sentences that the user should read.
+    """
+
+    methods: tuple[MethodResult, ...]
+    metrics: TrialMetrics
+    quality: Quality
+    truth: Truth | None
+    report: Path | None
+    notes: tuple[str, ...]
+
+
+def reconstruct(
+    stream: Trial,
+    out: Path,
+    method: str,
+    *,
+    beside: Sequence[str] = (),
+    report: bool = True,
+    title: str = "Trial",
+    command: str = "",
+    source: str = "",
+    on_pair: Callable[[int], None] | None = None,
+) -> Reconstruction:
+    """Trace a stream and write the outputs of ``docs/data.md`` into a folder.
+
+    Args:
+        stream: Recording or simulation.
+        out: Results folder.
+        method: Which method the files hold.
+        beside: Further methods for the table and the pictures.
+        report: Whether to draw ``report.html``.
+        title: Heading of the report.
+        command: Command that reproduces it.
+        source: File that it came from.
+        on_pair: Called with the number of pairs done.
+
+    Raises:
+        TipTraceError: the recording cannot give a trajectory; the message says why.
+    """
+    sync, watch = SyncReport(), _Watch(on_pair, keep_pairs=bool(beside), keep_images=report)
+    with open_tracer(stream, method) as tracer:
+        watch.tracer = tracer
+        trajectory = trace(stream, tracer, watch, sync)
+    others = (MethodResult(m, replay(watch.pairs, make_tracer(stream, m))) for m in beside)
+    methods = (MethodResult(method, trajectory), *others)
+    samples = stream.truth()
+    truth = Truth.from_samples(samples) if samples else None
+    notes = (*stream.notes, *sync.sentences())
+    metrics, quality = evaluate(trajectory, truth), _with_notes(assess(trajectory), notes)
+    write_results(out, trajectory, method, metrics, quality)
+    page = None
+    if report:
+        data = ReportData(
+            title=title,
+            methods=methods,
+            truth=truth,
+            tactile=watch.tactile(),
+            anchoring=watch.anchoring(),
+            step_ms=dict(zip(STEPS, np.asarray(watch.times_ms).T, strict=True)),
+            settings={
+                "method": method,
+                **{k: str(v) for k, v in stream.trial.items() if not isinstance(v, dict | list)},
+            },
+            versions=_versions(),
+            command=command,
+            source=source,
+            notes=notes,
+        )
+        page = write_trial_report(out, data)
+    return Reconstruction(methods, metrics, quality, truth, page, notes)
+
+
+def _with_notes(quality: Quality, notes: Sequence[str]) -> Quality:
+    """What was not used of a recording makes its trace at least doubtful."""
+    if not notes:
+        return quality
+    verdict = "warn" if quality.verdict == "pass" else quality.verdict
+    return Quality(verdict, (*quality.reasons, *notes))
+
+
+def _versions() -> dict[str, str]:
+    libraries = ("numpy", "scipy", "opencv-python-headless", "onnxruntime")
+    return {
+        "tiptrace": tiptrace.__version__,
+        "python": platform.python_version(),
+        **{name: version(name) for name in libraries},
+    }
+
+
+@dataclass
+class _Watch:
+    """Keeps what the report shows: step times, first and last pair, Stage I motions."""
+
+    on_pair: Callable[[int], None] | None
+    keep_pairs: bool
+    keep_images: bool
+    tracer: TipTracer | None = None
+    times_ms: list[tuple[float, float, float]] = field(default_factory=list)
+    pairs: list[SensedPair] = field(default_factory=list)
+    _first: tuple[Step, dict[Side, FloatArray | None]] | None = None
+    _last: Step | None = None
+    _motions: list[tuple[int, FloatArray, FloatArray]] = field(default_factory=list)
+
+    def show(self, step: Step) -> None:
+        """Keep what the report needs of a pair."""
+        self.times_ms.append(step.times_ms)
+        if self.keep_pairs:
+            self.pairs.append(step.sensed)
+        if self._first is None and step.estimate.markers:
+            self._first = (step, {side: self._depth_mm(side) for side in SIDES})
+        self._last = step
+        self._keep_motion(step)
+        if self.on_pair is not None:
+            self.on_pair(len(self.times_ms))
+
+    def _keep_motion(self, step: Step) -> None:
+        assert self.tracer is not None
+        estimator = self.tracer.estimator
+        if isinstance(estimator, PaperEstimator) and step.estimate.phase is Phase.ANCHORING:
+            motion = estimator.motion
+            if motion is not None:
+                self._motions.append((step.estimate.stamp_ns, motion.R, motion.d))
+
+    def _depth_mm(self, side: Side) -> FloatArray | None:
+        assert self.tracer is not None
+        finger = self.tracer.sensing.fingers.get(side)
+        if not self.keep_images or finger is None or finger.depth_m is None:
+            return None
+        return finger.depth_m.astype(np.float64) * 1e3
+
+    def tactile(self) -> tuple[TactileView, ...]:
+        """Both fingers at the first and last pair; empty for streams without images."""
+        if self._first is None or self._last is None:
+            return ()
+        first, depth_first = self._first
+        views = []
+        for side in SIDES:
+            start, end = first.observation.finger(side).sample, self._last.observation.finger(side).sample
+            if not isinstance(start, ImageSample) or not isinstance(end, ImageSample):
+                return ()
+            uv_first = first.sensed.finger(side).markers.uv_px
+            views.append(
+                TactileView(
+                    side=side,
+                    first_image=start.image,
+                    last_image=end.image,
+                    uv_first_px=uv_first,
+                    uv_last_px=self._last.sensed.finger(side).markers.uv_px,
+                    selected=self._selected(side, 0 if uv_first is None else len(uv_first)),
+                    depth_first_mm=depth_first[side],
+                    depth_last_mm=self._depth_mm(side),
+                )
+            )
+        return tuple(views)
+
+    def _selected(self, side: Side, count: int) -> np.ndarray[Any, np.dtype[np.bool_]] | None:
+        assert self.tracer is not None
+        chosen = (
+            self.tracer.estimator.chosen.get(side)
+            if isinstance(self.tracer.estimator, PaperEstimator)
+            else None
+        )
+        return None if chosen is None else np.isin(np.arange(count), chosen)
+
+    def anchoring(self) -> AnchoringFit | None:
+        """Residuals of Stage I with the final anchor."""
+        anchor = self.tracer.anchor if self.tracer else None
+        if anchor is None or not self._motions:
+            return None
+        stamps, R, d = (np.asarray(values) for values in zip(*self._motions, strict=True))
+        rows = anchor.p_B - R @ anchor.p_B - d  # (n, 3) (I − R_t) p̂ − d_t
+        return AnchoringFit(stamps.astype(np.int64), np.linalg.norm(rows, axis=1) * 1e3)

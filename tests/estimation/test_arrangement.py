@@ -1,0 +1,62 @@
+"""Swapped and mirrored fingers in simulated trials are refused; right ones are not."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tiptrace.errors import GeometryError
+from tiptrace.estimation.paper import PaperEstimator
+from tiptrace.sim.spec import make_spec
+from tiptrace.streams.simulated import SimulatedStream
+from tiptrace.streams.synchronise import synchronise
+from tiptrace.tracer import Sensing
+from tiptrace.types import FloatArray, SensedFinger, SensedPair
+
+Distort = Callable[[SensedPair], SensedPair]
+
+
+@pytest.fixture(scope="module")
+def pairs() -> list[SensedPair]:
+    stream = SimulatedStream(make_spec(mode="markers", level="nominal", seed=5, wrist="W2", travel_m=0.002))
+    sensing = Sensing(stream)
+    return [sensing(observation) for observation in synchronise(stream)]
+
+
+def mirrored(finger: SensedFinger, signs: FloatArray) -> SensedFinger:
+    return replace(finger, markers=replace(finger.markers, x_S=finger.markers.x_S * signs))
+
+
+def exchanged(pair: SensedPair) -> SensedPair:
+    left = replace(pair.left, markers=pair.right.markers)
+    return replace(pair, left=left, right=replace(pair.right, markers=pair.left.markers))
+
+
+U, V = np.array([-1.0, 1, 1]), np.array([1.0, -1, 1])
+WRONG: dict[str, Distort] = {
+    "left and right image were exchanged": exchanged,
+    "left image were mirrored left to right": lambda p: replace(p, left=mirrored(p.left, U)),
+    "right image were mirrored left to right": lambda p: replace(p, right=mirrored(p.right, U)),
+    "left image were mirrored top to bottom": lambda p: replace(p, left=mirrored(p.left, V)),
+    "right image were mirrored top to bottom": lambda p: replace(p, right=mirrored(p.right, V)),
+    "both images were mirrored left": lambda p: replace(
+        p, left=mirrored(p.left, U), right=mirrored(p.right, U)
+    ),
+}
+
+
+def run(pairs: list[SensedPair], distort: Distort) -> None:
+    estimator = PaperEstimator()
+    for pair in pairs:
+        estimator.update(distort(pair))
+
+
+def test_the_right_arrangement_passes(pairs: list[SensedPair]) -> None:
+    run(pairs, lambda pair: pair)
+
+
+@pytest.mark.parametrize("sentence", WRONG)
+def test_a_wrong_arrangement_is_named(pairs: list[SensedPair], sentence: str) -> None:
+    with pytest.raises(GeometryError, match=sentence):
+        run(pairs, WRONG[sentence])
