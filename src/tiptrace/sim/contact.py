@@ -53,12 +53,18 @@ class GelLaw:
 
 NODES = (20, 15)  # springs per pad along x_S and y_S
 FACE_M = (20e-3, 15e-3)
+_STAGGER = (0.0, 0.4, -0.2, 0.2, -0.4)  # of the pitch, column by column
 
 
 def node_grid() -> FloatArray:
-    """(300, 2) rest positions of one pad's springs in the gel plane of F_S, m."""
+    """(300, 2) rest positions of one pad's springs in the gel plane of F_S, m.
+
+    Columns are staggered along y: a tool's edge, which runs along x, meets springs one by one and not a whole row
+    at once, so that the force on it varies smoothly.
+    """
     axes = [(np.arange(n) + 0.5) * (size / n) - 0.5 * size for n, size in zip(NODES, FACE_M, strict=True)]
     x, y = np.meshgrid(*axes)
+    y = y + np.resize(_STAGGER, NODES[0]) * (FACE_M[1] / NODES[1])
     return np.stack([x.ravel(), y.ravel()], axis=1)
 
 

@@ -122,19 +122,16 @@ class Grasp:
         return wrench, J, pads, tip
 
     def solve(
-        self, state: GraspState, world: World, R: FloatArray, p: FloatArray, dt_s: float, limit: int = 40
+        self, state: GraspState, world: World, R: FloatArray, p: FloatArray, dt_s: float, limit: int = 30
     ) -> Equilibrium:
         """Newton's method with line search from the pose (R, p)."""
         wrench, J, pads, tip = self.balance(state, world, R, p, dt_s)
-        merit = _merit(wrench)
-        for iteration in range(limit):
-            if merit < _DONE:
-                break
-            step = _newton_step(wrench, J)
+        merit, taken = _merit(wrench), 0
+        while merit >= _DONE and taken < limit:
+            step = _newton_step(wrench, J, 0.0)
             fraction = 1.0
             for _ in range(7):
-                R_new = rotation_exp(fraction * step[3:]) @ R
-                p_new = p + fraction * step[:3]
+                R_new, p_new = rotation_exp(fraction * step[3:]) @ R, p + fraction * step[:3]
                 trial = self.balance(state, world, R_new, p_new, dt_s)
                 merit_new = _merit(trial[0])
                 if merit_new < merit * (1.0 - 1e-3 * fraction):
@@ -142,10 +139,27 @@ class Grasp:
                 fraction *= 0.5
             R, p, merit = R_new, p_new, merit_new
             wrench, J, pads, tip = trial
-        else:
-            iteration = limit
-        force, moment = float(np.linalg.norm(wrench[:3])), float(np.linalg.norm(wrench[3:]))
-        return Equilibrium(R, p, pads, tip, force, moment, iteration)
+            taken += 1
+        return _result(R, p, wrench, pads, tip, taken)
+
+    def relax(
+        self, state: GraspState, world: World, R: FloatArray, p: FloatArray, dt_s: float, limit: int = 400
+    ) -> Equilibrium:
+        """Overdamped motion from (R, p) until it rests: follows the tool through a snap, where Newton's method
+        is thrown back and forth across the fold.
+
+        Each step is implicit, with a damping that shrinks with the residual, so that it ends as Newton's method.
+        """
+        wrench, J, pads, tip = self.balance(state, world, R, p, dt_s)
+        merit, taken = _merit(wrench), 0
+        while merit >= _DONE and taken < limit:
+            damping = _DAMPING * min(1.0, float(np.sqrt(merit)) / 0.3) ** 2
+            step = _newton_step(wrench, J, damping)
+            R, p = rotation_exp(step[3:]) @ R, p + step[:3]
+            wrench, J, pads, tip = self.balance(state, world, R, p, dt_s)
+            merit = _merit(wrench)
+            taken += 1
+        return _result(R, p, wrench, pads, tip, taken)
 
     def take_hold(self, state: GraspState, world: World) -> GraspState:
         """The pads touch the tool where it is, without shear: the fingers close on a tool held by someone."""
@@ -171,11 +185,23 @@ def _merit(wrench: FloatArray) -> float:
     return float(wrench[:3] @ wrench[:3] + wrench[3:] @ wrench[3:] / _LEVER_M**2)
 
 
-def _newton_step(wrench: FloatArray, J: FloatArray) -> FloatArray:
-    """(6,) step, its length capped at 1 mm and 3°."""
+def _newton_step(wrench: FloatArray, J: FloatArray, damping: float) -> FloatArray:
+    """(6,) step, its length capped at 1 mm and 3°; damping in N/m."""
+    A = J - damping * _METRIC
     try:
-        step = np.linalg.solve(J, -wrench)
+        step = np.linalg.solve(A, -wrench)
     except np.linalg.LinAlgError:
-        step = np.linalg.lstsq(J, -wrench, rcond=None)[0]
+        step = np.linalg.lstsq(A, -wrench, rcond=None)[0]
     size = max(float(np.linalg.norm(step[:3])) / 1e-3, float(np.linalg.norm(step[3:])) / 0.05, 1.0)
     return np.asarray(step / size)
+
+
+_METRIC = np.diag([1.0, 1.0, 1.0, _LEVER_M**2, _LEVER_M**2, _LEVER_M**2])
+_DAMPING = 2e3  # N/m, the order of the pads' own stiffness
+
+
+def _result(
+    R: FloatArray, p: FloatArray, wrench: FloatArray, pads: PadForces, tip: TipForce, taken: int
+) -> Equilibrium:
+    force, moment = float(np.linalg.norm(wrench[:3])), float(np.linalg.norm(wrench[3:]))
+    return Equilibrium(R, p, pads, tip, force, moment, taken)

@@ -150,42 +150,46 @@ def centreline_from_csv(path: Path) -> Centreline:
 class Pit:
     """Dip of the groove at its start that holds the tip in Stage I: a steep wall behind, a long ramp ahead.
 
-    The ramp flattens slowly enough for the tip to leave without a jump.
+    The ramp flattens slowly enough for the tip to leave without a jump: contact force times curvature stays below
+    the grasp's stiffness along the travel.
 
     Attributes:
         depth_m: How deep.
-        ahead_m: Length of the ramp in the direction of travel.
-        behind_m: Length of the wall behind.
+        ahead_m: Length of the ramp in the direction of travel, along x; it is cubic.
+        behind_m: Length of the wall behind, a parabola.
         round_m: Half length of the rounding at the bottom.
     """
 
-    depth_m: float = 0.4e-3
-    ahead_m: float = 4.4e-3
+    depth_m: float = 0.5e-3
+    ahead_m: float = 6.0e-3
     behind_m: float = 0.9e-3
     round_m: float = 0.1e-3
 
     def at(self, x: float) -> tuple[float, float, float]:
-        """Centreline height z_c and its first two derivatives along x; two parabolas with a rounded meeting."""
+        """Centreline height z_c and its first two derivatives along x."""
         if self.depth_m == 0.0 or x >= self.ahead_m or x <= -self.behind_m:
             return 0.0, 0.0, 0.0
         e = self.round_m
-        if abs(x) < e:  # cubic Hermite between the parabolas
-            (z0, s0, _), (z1, s1, _) = self._parabola(-e), self._parabola(e)
-            h, u = 2 * e, (x + e) / (2 * e)
-            a, b = h * s0 - (z1 - z0), -h * s1 + (z1 - z0)
-            q = (1 - u) * a + u * b
-            z = (1 - u) * z0 + u * z1 + u * (1 - u) * q
-            dz = (z1 - z0 + (1 - 2 * u) * q + u * (1 - u) * (b - a)) / h
-            ddz = (-2 * q + 2 * (1 - 2 * u) * (b - a)) / (h * h)
-            return z, dz, ddz
-        return self._parabola(x)
+        if abs(x) >= e:
+            return self._flank(x)
+        (z0, s0, _), (z1, s1, _) = self._flank(-e), self._flank(e)  # a cubic joins the flanks
+        h, u = 2 * e, (x + e) / (2 * e)
+        a, b = h * s0 - (z1 - z0), -h * s1 + (z1 - z0)
+        q = (1 - u) * a + u * b
+        z = (1 - u) * z0 + u * z1 + u * (1 - u) * q
+        dz = (z1 - z0 + (1 - 2 * u) * q + u * (1 - u) * (b - a)) / h
+        ddz = (-2 * q + 2 * (1 - 2 * u) * (b - a)) / (h * h)
+        return z, dz, ddz
 
-    def _parabola(self, x: float) -> tuple[float, float, float]:
-        length = self.ahead_m if x > 0 else self.behind_m
-        sign = 1.0 if x > 0 else -1.0
+    def _flank(self, x: float) -> tuple[float, float, float]:
+        sign, length, n = (1.0, self.ahead_m, 3) if x > 0 else (-1.0, self.behind_m, 2)
         w = 1.0 - abs(x) / length
         d = self.depth_m
-        return -d * w * w, sign * 2 * d * w / length, -2 * d / (length * length)
+        return (
+            -d * w**n,
+            sign * n * d * w ** (n - 1) / length,
+            -n * (n - 1) * d * w ** (n - 2) / (length * length),
+        )
 
 
 @dataclass(frozen=True, slots=True)

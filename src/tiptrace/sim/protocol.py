@@ -12,6 +12,7 @@ from tiptrace.sim.spec import AnchorMotionName, TrialSpec
 from tiptrace.types import FloatArray, Phase
 
 _RAMP_S = 0.3  # start and end of the anchoring motion
+UNLOAD_S = 0.5  # end of Stage I: the hand, still again, rises to the contact force of the travel
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +72,7 @@ class Segment:
         from_m: Hand travel at its start.
         to_m: And at its end.
         anchoring: Whether the hand makes its anchoring motion.
+        rest_s: How long it rests at the end.
     """
 
     start_s: float
@@ -78,6 +80,7 @@ class Segment:
     from_m: float
     to_m: float
     anchoring: bool = False
+    rest_s: float = 0.0
 
     @property
     def end_s(self) -> float:
@@ -92,7 +95,8 @@ def plan(spec: TrialSpec) -> tuple[Segment, ...]:
 
     def add(duration: float, to: float, anchoring: bool = False) -> None:
         nonlocal now, travel
-        segments.append(Segment(now, duration, travel, to, anchoring))
+        rest = min(UNLOAD_S, 0.25 * duration) if anchoring else 0.0
+        segments.append(Segment(now, duration, travel, to, anchoring, rest))
         now, travel = now + duration, to
 
     if spec.anchoring_s > 0.0:
@@ -159,7 +163,7 @@ class Hand:
         """T_B_E (4, 4) at time t, without the guard's correction."""
         s = self.segment(t)
         ramp = _RAMP_S if s.anchoring else self.spec.ramp_s
-        fraction = travelled(t - s.start_s, s.duration_s, ramp)
+        fraction = travelled(t - s.start_s, s.duration_s - s.rest_s, ramp)
         T = self.T_B_E_start.copy()
         if s.anchoring:
             motion = ANCHOR_MOTIONS[self.spec.anchor_motion]

@@ -8,6 +8,7 @@ function of width and length, so a gel point's overlap with the tool is explicit
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 
@@ -22,32 +23,50 @@ _GRAVITY = 9.81
 _FLANK_SLOPE = float(np.tan(np.radians(60.0)))  # steeper walls leave the gel: it cannot follow them
 
 
+class Drop(Protocol):
+    """How far the surface lies below the flat, and its first two derivatives, at the distance u beyond it."""
+
+    def drop(self, u: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """(n,) drop m, slope, curvature 1/m; zero for u ≤ 0."""
+        ...
+
+
 @dataclass(frozen=True, slots=True)
 class Corner:
-    """How far the surface drops beyond the end of a flat: a fillet, then a straight flank.
+    """An edge: the surface bends away over ``run_m`` with continuous curvature, then falls at a straight slope.
 
     Attributes:
-        radius_m: Fillet radius.
+        run_m: Length over which it bends.
         slope: Slope of the flank.
     """
 
-    radius_m: float
+    run_m: float
     slope: float = _FLANK_SLOPE
 
-    @property
-    def run_m(self) -> float:
-        """Length of the fillet along the surface's plane, up to the flank's slope."""
-        return self.radius_m * self.slope / float(np.hypot(1.0, self.slope))
+    def drop(self, u: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """See :class:`Drop`; the curvature is a raised cosine."""
+        L, w = self.run_m, 2.0 * np.pi / self.run_m
+        v = np.clip(u, 0.0, L)
+        g = self.slope / L * (0.5 * v * v - (1.0 - np.cos(w * v)) / w**2) + self.slope * np.maximum(u - L, 0.0)
+        return g, self.slope / L * (v - np.sin(w * v) / w), self.slope / L * (1.0 - np.cos(w * v))
+
+
+@dataclass(frozen=True, slots=True)
+class Round:
+    """A cylinder's surface, straight beyond the flank's slope (which is deeper than any contact).
+
+    Attributes:
+        radius_m: Its radius.
+    """
+
+    radius_m: float
 
     def drop(self, u: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Drop below the flat and its first two derivatives at the distance u from where the fillet starts, m."""
-        r, u_c = self.radius_m, self.run_m
-        arc = np.clip(u, 0.0, u_c)
-        root = np.sqrt(r * r - arc * arc)
-        g = r - root + self.slope * np.maximum(u - u_c, 0.0)
-        first = arc / root
-        second = np.where((u > 0.0) & (u < u_c), r * r / root**3, 0.0)
-        return g, first, second
+        """See :class:`Drop`."""
+        r, u_c = self.radius_m, self.radius_m * _FLANK_SLOPE / float(np.hypot(1.0, _FLANK_SLOPE))
+        v = np.clip(u, 0.0, u_c)
+        root = np.sqrt(r * r - v * v)
+        return r - root + _FLANK_SLOPE * np.maximum(u - u_c, 0.0), v / root, np.where(u < u_c, r * r / root**3, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +110,7 @@ class ToolShape:
     section: str
     thickness_m: float
     flat_m: float
-    corner: Corner
+    corner: Drop
     width_m: float
     length_m: float = LENGTH_M
     bend_deg: float = 0.0
@@ -160,22 +179,21 @@ class ToolShape:
         return height.reshape(np.shape(x))
 
 
-_END_CORNER = Corner(1.0e-3)
+_END_CORNER = Corner(1.5e-3)
 
 
 def _tool(name: str, section: str, thickness_m: float) -> ToolShape:
     """A tool of the paper at a given thickness."""
-    half = 0.5 * thickness_m
+    corner = Corner(1.5e-3)
     if section in ("rectangular", "bent"):
-        width, corner = 7.5e-3, Corner(1.0e-3)
-        tool = ToolShape(name, section, thickness_m, width - 2 * corner.radius_m, corner, width)
+        width = 7.5e-3
+        tool = ToolShape(name, section, thickness_m, width - 1.2 * corner.run_m, corner, width)
         return replace(tool, bend_deg=12.0, bend_above_tip_m=30e-3) if section == "bent" else tool
     if section == "hexagonal":  # a flat faces each pad; the neighbouring faces fall away at 60°
-        corner = Corner(0.8e-3)
         face = thickness_m / np.sqrt(3.0)
-        setback = corner.radius_m * np.tan(np.radians(30.0))  # where a fillet between faces at 60° starts
-        return ToolShape(name, section, thickness_m, face - 2 * setback, corner, 2 * face)
-    return ToolShape(name, section, thickness_m, 0.0, Corner(half), thickness_m)
+        flat = face - corner.run_m  # half a run on either side: the flank's line then meets the flat's at the edge
+        return ToolShape(name, section, thickness_m, flat, corner, 2 * face)
+    return ToolShape(name, section, thickness_m, 0.0, Round(0.5 * thickness_m), thickness_m)
 
 
 _SECTIONS = {"O1": "rectangular", "O2": "hexagonal", "O3": "cylindrical", "O4": "bent"}

@@ -25,7 +25,7 @@ MAX_STEP_S = 0.02
 _BISECTIONS = 6
 _PRESS_STEP_M = 0.1e-3
 _PRESS_LIMIT_M = 6e-3
-_GUARD_BAND = (0.7, 1.5)  # of the preload
+_GUARD_BAND = (0.8, 1.4)  # of the anchoring force
 _GUARD_GAIN = 0.7 / 3000.0  # m/N per step: a little under the grasp's own compliance along the tool
 _LEAST_GRIP_N = 0.5
 
@@ -91,6 +91,8 @@ class TrialPhysics:
     T_E_S: dict[str, FloatArray] = field(init=False)
     _state: GraspState = field(init=False)
     _guard_m: float = field(init=False, default=0.0)
+    _guard_end_m: float = field(init=False, default=0.0)
+    _travel_rise_m: float = field(init=False, default=0.0)
     _velocity: tuple[FloatArray, FloatArray] | None = field(init=False, default=None)
     _slip: SlipMeter = field(init=False)
 
@@ -147,26 +149,33 @@ class TrialPhysics:
         return T
 
     def _press_down(self, T_B_E: FloatArray) -> FloatArray:
-        """Lower the hand until the groove pushes back with the preload, then let it rest."""
+        """Lower the hand until the groove pushes back with the anchoring force, then let it rest.
+
+        Notes by how much the hand has to rise after Stage I for the travel's preload outside the pit.
+        """
+        assert self.groove is not None
         T = T_B_E.copy()
-        mu = self.grasp.pads.law.friction
+        mu, wanted = self.grasp.pads.law.friction, self.spec.anchor_force_n
         self._to_equilibrium(World(T, mu), 0.05, "pressing down")
-        step, steps = _PRESS_STEP_M, int(_PRESS_LIMIT_M / _PRESS_STEP_M)
-        for _ in range(steps):
-            missing = self.spec.preload_n - self._last.tip.force[2]
-            if missing <= 0.0:
-                break
-            if self._last.tip.force[2] > 0.3:
-                step = float(np.clip(missing / 4000.0, 5e-6, _PRESS_STEP_M))
+        force = lowered = 0.0
+        stiffness = 3e3
+        while force < wanted - 0.01:
+            step = _PRESS_STEP_M if force < 0.3 else float(np.clip((wanted - force) / stiffness, 1e-6, _PRESS_STEP_M))
             T[2, 3] -= step
+            lowered += step
             self._to_equilibrium(World(T.copy(), mu), 0.05, "pressing down")
-        else:
-            raise SimulationError(
-                f"the grasp does not hold the tool: pressing down by {_PRESS_LIMIT_M * 1e3:.0f} mm gave only "
-                f"{self._last.tip.force[2]:.2f} N of the {self.spec.preload_n:.1f} N of preload"
-            )
+            before, force = force, float(self._last.tip.force[2])
+            if before > 0.3:
+                stiffness = max((force - before) / step, 500.0)
+            if lowered > _PRESS_LIMIT_M:
+                raise SimulationError(
+                    f"the grasp does not hold the tool: pressing down by {lowered * 1e3:.0f} mm gave only "
+                    f"{force:.2f} N of the {wanted:.1f} N asked for"
+                )
         for _ in range(10):
             self._to_equilibrium(World(T, mu), 0.2, "resting")
+        self._travel_rise_m = (float(self._last.tip.force[2]) - self.spec.preload_n) / stiffness
+        self._travel_rise_m += self.groove.pit.depth_m
         return T
 
     # --- the trial ------------------------------------------------------------------------------------------
@@ -207,12 +216,27 @@ class TrialPhysics:
             yield self._frame(index, t_last, T_last, retried)
 
     def _guard(self, t: float) -> None:
-        """Force guard of Stage I: the hand yields along z when the contact force leaves its band."""
-        if not (self.spec.anchor_guard and self.hand.segment(t).anchoring):
+        """Height of the hand above its plan: a force guard in Stage I, then what the travel's preload needs.
+
+        While the hand turns about a tip that it knows badly, it yields along z whenever the contact force leaves
+        its band; then it moves to the height of the travel and stays there.
+        """
+        segment = self.hand.segment(t)
+        moving_until = segment.end_s - segment.rest_s
+        if segment.anchoring and t <= moving_until:
+            if self.spec.anchor_guard:
+                N = float(self._last.tip.force[2])
+                force = self.spec.anchor_force_n if segment.start_s == 0.0 else self.spec.preload_n
+                low, high = (b * force for b in _GUARD_BAND)
+                self._guard_m += _GUARD_GAIN * (max(N - high, 0.0) - max(low - N, 0.0))
+            self._guard_end_m = self._guard_m
             return
-        N = float(self._last.tip.force[2])
-        low, high = (b * self.spec.preload_n for b in _GUARD_BAND)
-        self._guard_m += _GUARD_GAIN * (max(N - high, 0.0) - max(low - N, 0.0))
+        if segment.anchoring:
+            u = (t - moving_until) / segment.rest_s
+            blend = u * u * (3.0 - 2.0 * u)
+            self._guard_m = self._guard_end_m + (self._travel_rise_m - self._guard_end_m) * blend
+        else:
+            self._guard_m = self._travel_rise_m
 
     def _move(
         self, T_from: FloatArray, T_to: FloatArray, mu: float, push: FloatArray, dt: float, where: str
@@ -225,7 +249,8 @@ class TrialPhysics:
         while pieces:
             a, b, depth = pieces.pop()
             T = interpolate(T_from, T_to, b)
-            if self._try(World(T, mu, push), dt * (b - a)):
+            world, step = World(T, mu, push), dt * (b - a)
+            if (depth and self._try(world, step)) or self._relaxes(world, step):
                 continue
             if depth == _BISECTIONS:
                 self._fail(where)
@@ -239,8 +264,13 @@ class TrialPhysics:
         if self._velocity is not None:
             p = p + self._velocity[0] * dt
         equilibrium = self.grasp.solve(state, world, R, p, dt)
-        if not equilibrium.converged and self._velocity is not None:
-            equilibrium = self.grasp.solve(state, world, R, state.p, dt)
+        if not equilibrium.converged:
+            return False
+        self._accept(equilibrium, dt)
+        return True
+
+    def _relaxes(self, world: World, dt: float) -> bool:
+        equilibrium = self.grasp.relax(self._state, world, self._state.R, self._state.p, dt)
         if not equilibrium.converged:
             return False
         self._accept(equilibrium, dt)
@@ -256,7 +286,7 @@ class TrialPhysics:
 
     def _to_equilibrium(self, world: World, dt: float, where: str) -> None:
         self._velocity = None
-        if not self._try(world, dt):
+        if not (self._try(world, dt) or self._relaxes(world, dt)):
             self._fail(where)
 
     def _fail(self, where: str) -> None:
