@@ -49,7 +49,7 @@ class FullEstimator:
         self._prior = tip_prior(tool) if c.use_tip_prior else None
         self._track = PoseTrack(c.pose_memory_s, c.pose_half_width_s)
         self._stage_one = StageOne(c.stage_one, c.patch, c.motion, c.tip_map, c.pose_half_width_s)
-        self._running = RunningTip(self._prior, c.tip_noise_m)
+        self._running = RunningTip(self._prior, c.tip_noise_m, c.tip_map.map_sigma)
         self._running_fit: TemplateFit | None = None
         self._last_motion: tuple[FloatArray, FloatArray] | None = None
         self._anchoring: Anchoring | None = None
@@ -101,9 +101,10 @@ class FullEstimator:
         hand = self._hand(stamp_ns)
         if hand is None or not self._usable(motions):
             return estimate
+        if n < 5:  # before the running template stands
+            return estimate
         T_B_E = hand.T_B_E[0]
-        if n >= 5:
-            self._running.add(motions, T_B_E)
+        self._running.add(motions, T_B_E)
         estimate = replace(
             estimate, R_B_E=T_B_E[:3, :3] @ motions.R[0], residual_m=float(motions.residual_m[0])
         )

@@ -162,27 +162,33 @@ def _select(m: Motions, good: BoolArray) -> Motions:
 
 
 class RunningTip:
-    """Tip so far during Stage I: 6×6 normal equations of ``T_B_E (R c + t) = p``, the gel taken at its word."""
+    """Tip so far during Stage I: 6×6 normal equations of ``T_B_E (R c + t) = p``, the gel taken at its word.
 
-    def __init__(self, prior: TipPrior | None, sigma_m: float) -> None:
+    That the gel may show a tenth less or more is carried as one common unknown that is considered, not solved for.
+    """
+
+    def __init__(self, prior: TipPrior | None, sigma_m: float, gain_sigma: float) -> None:
         self._N, self._b, self._frames = np.zeros((6, 6)), np.zeros(6), 0
-        self._lever: FloatArray | None = None
-        self._sigma_m = sigma_m
+        self._gain = np.zeros(6)  # Aᵀ W ∂y/∂gain
+        self._gain_sigma, self._sigma_m = gain_sigma, sigma_m
+        self._lever: FloatArray = np.array([0.0, 0.0, 0.06]) if prior is None else prior.c
+        self._from_centre = prior is None
         if prior is not None:
             self._N[:3, :3] = np.linalg.inv(prior.covariance)
             self._b[:3] = self._N[:3, :3] @ prior.c
 
     def add(self, motions: Motions, T_B_E: FloatArray) -> None:
         """One frame."""
-        R_BE, t_BE = T_B_E[:3, :3], T_B_E[:3, 3]
-        lever = np.array([0.0, 0.0, 0.06]) if self._lever is None else self._lever
-        B = np.concatenate([-skew(lever), np.eye(3)], axis=1)
+        R_BE, t_BE, R, t = T_B_E[:3, :3], T_B_E[:3, 3], motions.R[0], motions.t[0]
+        c = motions.centre[0] + self._lever if self._from_centre else self._lever
+        B = np.concatenate([-skew(c - motions.centre[0]), np.eye(3)], axis=1)
         S = B @ motions.covariance[0] @ B.T + self._sigma_m**2 * np.eye(3)
         W = R_BE @ np.linalg.inv(S) @ R_BE.T
-        A = np.concatenate([R_BE @ motions.R[0], -np.eye(3)], axis=1)
-        y = R_BE @ motions.t[0] + t_BE
-        self._N += A.T @ W @ A
-        self._b -= A.T @ W @ y
+        A = np.concatenate([R_BE @ R, -np.eye(3)], axis=1)
+        AW = A.T @ W
+        self._N += AW @ A
+        self._b -= AW @ (R_BE @ t + t_BE)
+        self._gain += AW @ (R_BE @ (R @ c + t - c))
         self._frames += 1
 
     def solve(self) -> tuple[FloatArray, FloatArray] | None:
@@ -191,4 +197,6 @@ class RunningTip:
             return None
         covariance = covariance_from_information(self._N)
         theta = covariance @ self._b
-        return theta[3:], covariance[3:, 3:]
+        shift = self._gain_sigma * (covariance @ self._gain)
+        total = covariance + np.outer(shift, shift)
+        return theta[3:], total[3:, 3:]

@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from tiptrace.estimation.anchor import TipPrior, fixed_point_ml
 from tiptrace.estimation.motion import Motions
 from tiptrace.estimation.pose_track import HandStates
-from tiptrace.estimation.robust import huber_weight
+from tiptrace.estimation.robust import scale_from_median, tukey_weight
 from tiptrace.geometry.transforms import rotation_exp, skew
 from tiptrace.types import BoolArray, FloatArray
 
@@ -42,7 +42,7 @@ class TipMapConfig(BaseModel):
     drift_evidence: float = Field(default=3.0, gt=0)  # sigmas
     pose_sigma_m: float = Field(default=4e-5, gt=0)  # of the tip through the smoothed hand pose
     model_sigma_m: float = Field(default=5e-5, gt=0)  # what a linear map leaves
-    huber: float = Field(default=2.5, gt=0)
+    outlier: float = Field(default=6.0, gt=0)  # whitened residual of a frame in which the tip did not rest
     iterations: int = Field(default=15, ge=3)
 
 
@@ -197,7 +197,7 @@ class _Solver:
         centre = np.einsum("tij,tj->ti", R_BE, self._m.centre) + T[:, :3, 3]
         Sigma = rotate @ self._m.covariance @ np.swapaxes(rotate, 1, 2)
         Sigma[:, range(3, 6), range(3, 6)] += self._config.pose_sigma_m**2 + self._config.model_sigma_m**2
-        point = fixed_point_ml(R_BE @ self._m.R, t, Sigma, centre, prior=self._prior)
+        point = fixed_point_ml(R_BE @ self._m.R, t, Sigma, centre, prior=self._prior, outliers=True)
         theta = self._mean.copy()
         theta[C], theta[P] = point.c, point.p
         return theta
@@ -215,7 +215,7 @@ class _Solver:
         delta = np.zeros((len(self._phase), 6))
         weights = np.ones(len(self._phase))
         index = np.flatnonzero(free)
-        for _ in range(self._config.iterations):
+        for iteration in range(self._config.iterations):
             A, S_inv, w, lever = self._linearise(theta, delta)
             WA = weights[:, None, None] * (S_inv @ A)
             N = np.einsum("tij,tik->jk", A, WA, optimize=True) + self._prior_N
@@ -226,12 +226,13 @@ class _Solver:
             misfit = w + A @ step
             k = np.einsum("tij,tj->ti", S_inv, misfit)
             length = np.sqrt(np.maximum(np.einsum("ti,ti->t", misfit, k), 0.0))
-            weights = huber_weight(length, self._config.huber * max(1.0, float(np.median(length)) / 1.54))
+            scale = max(1.0, scale_from_median(length))
+            weights = tukey_weight(length, max(self._config.outlier, 20.0 * 0.7**iteration) * scale)
             delta = -np.einsum(
                 "tij,tj->ti", self._m.covariance, np.concatenate([np.cross(lever, k), k], axis=1)
             )
             theta = theta + step
-            if np.abs(step[:6]).max() < 1e-7:
+            if iteration > 4 and np.abs(step[:6]).max() < 1e-7:
                 break
         return self._finish(theta, free, delta, weights)
 
@@ -271,7 +272,8 @@ class _Solver:
         """Covariance with correlated residuals, rotation noise not counted as motion, gates' priors kept."""
         A, S_inv, _, _ = self._linearise(theta, delta)
         r = self._linearise(theta, np.zeros_like(delta))[2]
-        factor = _inflation(r, S_inv)
+        rested = weights > 0.1
+        factor = _inflation(r[rested], S_inv[rested])
         N = np.einsum("tij,tik->jk", A, weights[:, None, None] * (S_inv @ A), optimize=True) / factor
         N[C, C] -= self._spurious(S_inv, weights) / factor
         N += self._prior_N
@@ -287,7 +289,7 @@ class _Solver:
             covariance[np.ix_(f, h)] = K @ P_h
             covariance[np.ix_(h, f)] = P_h @ K.T
             covariance[np.ix_(h, h)] = P_h
-        rms = float(np.sqrt(np.mean(np.sum(r * r, axis=1))))
+        rms = float(np.sqrt(np.average(np.sum(r * r, axis=1), weights=np.maximum(weights, 1e-9))))
         return _Solution(theta, covariance, free, rms, factor, r)
 
     def _spurious(self, S_inv: FloatArray, weights: FloatArray) -> FloatArray:
