@@ -22,6 +22,7 @@ MAY_IMPORT = {
     "outputs": BASE | {"geometry", "evaluation"},
     "tracer": BASE | {"geometry", "perception", "estimation"},
     "pipeline": BASE | {"geometry", "streams", "tracer"},
+    "reconstruction": BASE | {"estimation", "evaluation", "geometry", "outputs", "pipeline", "streams", "tracer"},
 }
 
 
