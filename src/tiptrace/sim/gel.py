@@ -233,7 +233,7 @@ def _shear_at(deformation: GelDeformation, points: FloatArray) -> FloatArray:
     if len(contact.nodes_m) == 0:
         return np.zeros((len(points), 2))
     overlap = deformation.grid.at(contact.penetration_m, contact.nodes_m, order=1)  # (k,)
-    weight = np.clip(overlap / 50e-6, 1e-3, 1)  # a node that just touches counts little: no jumps
+    weight = np.clip(overlap / 50e-6, 1e-6, 1)  # a node that just touches counts little: no jumps
     fit = _local_linear(points, contact.nodes_m, contact.shear_m, weight, gel.follow_m)
     engaged = deformation.grid.at(deformation.engaged, points, order=1)
     return fit * np.clip(engaged, 0, 1)[:, None]
