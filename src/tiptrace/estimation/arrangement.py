@@ -23,7 +23,7 @@ _BETTER = (
 )
 _AT_LEAST_M = 1.0e-3  # smaller residuals are noise under any arrangement
 _AS_IS = (1.0, 1.0, 1.0)
-_ALONG_X, _ALONG_Y = (-1.0, 1.0, 1.0), (1.0, -1.0, 1.0)
+_ALONG_X, _ALONG_Y, _TURNED = (-1.0, 1.0, 1.0), (1.0, -1.0, 1.0), (-1.0, -1.0, 1.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +45,9 @@ _WRONG_ONES = (
     _Arrangement("the right image were mirrored top to bottom", right=_ALONG_Y),
     _Arrangement("both images were mirrored left to right", left=_ALONG_X, right=_ALONG_X),
     _Arrangement("both images were mirrored top to bottom", left=_ALONG_Y, right=_ALONG_Y),
+    _Arrangement(
+        "both sensors were turned by half (T_E_S quaternions are x, y, z, w)", left=_TURNED, right=_TURNED
+    ),
 )
 
 
