@@ -86,7 +86,8 @@ class TrialSpec(_Model):
         travel_m: Hand travel in Stage II, along +x.
         speed_mps: Its speed.
         ramp_s: Acceleration and deceleration time.
-        preload_n: Contact force at the start of the travel, outside the pit.
+        preload_n: Contact force of the travel while the tool still stands as in Stage I; friction then leans it
+            back, which takes some of it.
         anchor_force_n: Contact force in Stage I; at its end the hand rises to what the travel needs.
         indentation_m: Of the tool into each pad.
         marker_grid: Rows and columns of dots.
@@ -116,7 +117,7 @@ class TrialSpec(_Model):
     travel_m: NotNegative = 0.2
     speed_mps: Annotated[float, Field(gt=0, le=0.25)] = 0.02
     ramp_s: NotNegative = 0.4
-    preload_n: Annotated[float, Field(ge=0, le=15)] = 3.0
+    preload_n: Annotated[float, Field(ge=0, le=15)] = 4.5
     anchor_force_n: Annotated[float, Field(gt=0, le=15)] = 4.5
     indentation_m: Annotated[float, Field(gt=0, lt=3e-3)] = 1.2e-3
     marker_grid: tuple[Annotated[int, Field(ge=2, le=40)], Annotated[int, Field(ge=2, le=40)]] = (7, 9)

@@ -93,6 +93,8 @@ class TrialPhysics:
     _guard_m: float = field(init=False, default=0.0)
     _guard_end_m: float = field(init=False, default=0.0)
     _travel_rise_m: float = field(init=False, default=0.0)
+    _stiffness: float = field(init=False, default=4e3)
+    _anchored: bool = field(init=False, default=False)
     _velocity: tuple[FloatArray, FloatArray] | None = field(init=False, default=None)
     _slip: SlipMeter = field(init=False)
 
@@ -149,11 +151,7 @@ class TrialPhysics:
         return T
 
     def _press_down(self, T_B_E: FloatArray) -> FloatArray:
-        """Lower the hand until the groove pushes back with the anchoring force, then let it rest.
-
-        Notes by how much the hand has to rise after Stage I for the travel's preload outside the pit.
-        """
-        assert self.groove is not None
+        """Lower the hand until the groove pushes back with the anchoring force, then let it rest."""
         T = T_B_E.copy()
         mu, wanted = self.grasp.pads.law.friction, self.spec.anchor_force_n
         self._to_equilibrium(World(T, mu), 0.05, "pressing down")
@@ -174,9 +172,17 @@ class TrialPhysics:
                 )
         for _ in range(10):
             self._to_equilibrium(World(T, mu), 0.2, "resting")
-        self._travel_rise_m = (float(self._last.tip.force[2]) - self.spec.preload_n) / stiffness
-        self._travel_rise_m += self.groove.pit.depth_m
+        self._probe(T)
         return T
+
+    def _probe(self, T_B_E: FloatArray) -> None:
+        """Measure the grasp's stiffness along z by a small lift."""
+        T, mu = T_B_E.copy(), self.grasp.pads.law.friction
+        pressed = float(self._last.tip.force[2])
+        T[2, 3] += _PRESS_STEP_M
+        self._to_equilibrium(World(T, mu), 0.05, "probing")
+        self._stiffness = max((pressed - float(self._last.tip.force[2])) / _PRESS_STEP_M, 500.0)
+        self._to_equilibrium(World(T_B_E, mu), 0.05, "probing")
 
     # --- the trial ------------------------------------------------------------------------------------------
 
@@ -222,21 +228,33 @@ class TrialPhysics:
         its band; then it moves to the height of the travel and stays there.
         """
         segment = self.hand.segment(t)
+        if not segment.anchoring:
+            if t > 0.0 and not self._anchored:
+                self._plan_rise(segment.from_m)
+                self._guard_m = self._travel_rise_m
+            return
         moving_until = segment.end_s - segment.rest_s
-        if segment.anchoring and t <= moving_until:
+        if t <= moving_until:
+            self._anchored = False
             if self.spec.anchor_guard:
                 N = float(self._last.tip.force[2])
                 force = self.spec.anchor_force_n if segment.start_s == 0.0 else self.spec.preload_n
                 low, high = (b * force for b in _GUARD_BAND)
                 self._guard_m += _GUARD_GAIN * (max(N - high, 0.0) - max(low - N, 0.0))
-            self._guard_end_m = self._guard_m
             return
-        if segment.anchoring:
-            u = (t - moving_until) / segment.rest_s
-            blend = u * u * (3.0 - 2.0 * u)
-            self._guard_m = self._guard_end_m + (self._travel_rise_m - self._guard_end_m) * blend
-        else:
-            self._guard_m = self._travel_rise_m
+        if not self._anchored:
+            self._plan_rise(segment.from_m)
+        u = (t - moving_until) / segment.rest_s
+        self._guard_m = self._guard_end_m + (self._travel_rise_m - self._guard_end_m) * u * u * (3.0 - 2.0 * u)
+
+    def _plan_rise(self, travelled_m: float) -> None:
+        """Decide on the height of the travel: from the force now to the preload, and out of the pit."""
+        assert self.groove is not None
+        self._anchored = True
+        self._guard_end_m = self._guard_m
+        climb = self.groove.pit.depth_m if travelled_m == 0.0 else 0.0
+        excess = float(self._last.tip.force[2]) - self.spec.preload_n
+        self._travel_rise_m = self._guard_m + climb + excess / self._stiffness
 
     def _move(
         self, T_from: FloatArray, T_to: FloatArray, mu: float, push: FloatArray, dt: float, where: str
