@@ -78,12 +78,16 @@ def inverted() -> dict[str, Any]:
 
 
 def wxyz() -> dict[str, Any]:
-    """A gripper that closes along y_E, the quaternion's w written first."""
+    """A gripper that closes along z_E, the quaternion's w written first.
+
+    With fingers that close along x_E or y_E that mistake is a half turn of both sensors, a mounting that exists;
+    there Stage I finds it (tests/estimation/test_arrangement.py).
+    """
     data = rig()
-    data["gripper"]["closing_axis_E"] = [0, 1, 0]
-    for side, y_m in zip(SIDES, (0.0031, -0.0031), strict=True):
-        R = rotation_exp([0, 0, np.pi / 2]) @ parse(rig()).T_E_S(side)[:3, :3]
-        data["sensors"][side]["T_E_S"]["translation_m"] = [0, y_m, 0.14]
+    data["gripper"]["closing_axis_E"] = [0, 0, -1]
+    for side, z_m in zip(SIDES, (0.1369, 0.1431), strict=True):
+        R = rotation_exp([0, np.pi / 2, 0]) @ parse(rig()).T_E_S(side)[:3, :3]
+        data["sensors"][side]["T_E_S"]["translation_m"] = [0, 0, z_m]
         x, y, z, w = quaternion_from_rotation(R).tolist()
         data["sensors"][side]["T_E_S"]["quaternion_xyzw"] = [w, x, y, z]
     return data

@@ -147,7 +147,7 @@ class Rig(_Model):
     @model_validator(mode="after")
     def _fingers_face_each_other(self) -> Self:
         T_left, T_right = (self.sensor(side).T_E_S.matrix() for side in SIDES)
-        if float(T_left[:3, 2] @ T_right[:3, 2]) > -0.8:
+        if float(T_left[:3, 2] @ T_right[:3, 2]) > -0.95:
             raise ValueError(
                 "the two gels do not face each other: +z_S must point out of each gel towards the tool; "
                 "check T_E_S (quaternion order is x, y, z, w; T_E_S maps sensor to end-effector coordinates)"
