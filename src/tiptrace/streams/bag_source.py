@@ -60,9 +60,10 @@ class BagSource:
         try:
             reader = AnyReader([self._path], default_typestore=get_typestore(Stores.ROS2_JAZZY))
             reader.open()
-        except (AnyReaderError, *_errors()) as error:
+        except _errors() as error:
             raise RecordingError(
-                f"{self._path}: is not a rosbag2 recording that can be read ({_line(error)})"
+                f"{self._path}: is not a rosbag2 recording that can be read ({_line(error)}); repair it "
+                "with 'ros2 bag reindex', or record it again"
             ) from None
         return reader
 
