@@ -39,7 +39,7 @@ class DotLayout:
     angle_deg: float = 0.0
     jitter_m: float = 0.02e-3
     uneven: float = 0.03
-    darkness: float = 0.75
+    darkness: float = 0.73
     edge_m: float = 0.075e-3
     glint: float = 8.0
 

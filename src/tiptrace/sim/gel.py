@@ -111,9 +111,9 @@ class GelParameters:
     """
 
     thickness_m: float = 4e-3
-    skirt_m: float = 0.8e-3
+    skirt_m: float = 1.0e-3
     tail_m: float = 2.2e-3
-    tail_weight: float = 0.45
+    tail_weight: float = 0.35
     rounding_m: float = 0.3e-3
     coating_m: float = 0.1e-3
     shear_decay_m: float = 2.5e-3

@@ -127,7 +127,7 @@ def optics_from_dict(data: dict[str, Any]) -> Optics:
 
 
 def gel_optics(seed: int | None) -> Optics:
-    """Another gel of the same make: lamps, coating and background vary by what one sees between units.
+    """Another gel of the same make: lamps within a degree, light within some per cent.
 
     Args:
         seed: None gives the fitted gel itself.
@@ -136,15 +136,15 @@ def gel_optics(seed: int | None) -> Optics:
     if seed is None:
         return nominal
     rng = np.random.default_rng([seed, 0x6E1])
-    turned = _turn(nominal.lamp_toward, rng, np.radians(4))
-    strength = nominal.lamp_strength * np.exp(rng.normal(0, 0.08, nominal.lamp_strength.shape))
+    turned = _turn(nominal.lamp_toward, rng, np.radians(1.0))
+    strength = nominal.lamp_strength * np.exp(rng.normal(0, 0.04, nominal.lamp_strength.shape))
     return replace(
         nominal,
         background=_vary_background(nominal.background, rng, 0.05),
         lamp_toward=turned,
         lamp_strength=strength,
-        ambient=nominal.ambient * np.exp(rng.normal(0, 0.1, 3)),
-        lamp_distance_m=nominal.lamp_distance_m * float(np.exp(rng.normal(0, 0.15))),
+        ambient=nominal.ambient * np.exp(rng.normal(0, 0.04, 3)),
+        lamp_distance_m=nominal.lamp_distance_m * float(np.exp(rng.normal(0, 0.08))),
         gloss=float(rng.uniform(2, 8)),
     )
 
@@ -156,8 +156,8 @@ def unseen_optics(seed: int) -> Optics:
     return replace(
         gel,
         background=_vary_background(gel.background, rng, 0.10),
-        lamp_toward=_turn(gel.lamp_toward, rng, np.radians(9)),
-        lamp_strength=gel.lamp_strength * np.exp(rng.normal(0, 0.2, gel.lamp_strength.shape)),
+        lamp_toward=_turn(gel.lamp_toward, rng, np.radians(4.0)),
+        lamp_strength=gel.lamp_strength * np.exp(rng.normal(0, 0.15, gel.lamp_strength.shape)),
         softness=gel.softness * float(rng.uniform(0.5, 0.7)),
         lamp_distance_m=gel.lamp_distance_m * float(rng.uniform(0.55, 0.7)),
         gloss=float(rng.uniform(12, 22)),
