@@ -9,11 +9,14 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tiptrace.geometry.transforms import skew
 from tiptrace.sim.groove import Groove
-from tiptrace.sim.tools import ToolShape
+from tiptrace.sim.tools import Overlap, ToolShape
 from tiptrace.types import SIDES, BoolArray, FloatArray
+
+IntArray = NDArray[np.intp]
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,81 +164,151 @@ def pad_forces(
     friction springs hold a material point until the Coulomb cone is reached, then follow it (return mapping).
     """
     law = pads.law
-    rho = dt_s / law.creep_s
-    instant = 1.0 - law.creep * rho / (1.0 + rho)  # share of the stiffness acting on the new displacement
-    memory = law.creep / (1.0 + rho)  # and on the relaxed part
-    r = pads.X - p  # (n, 3)
-    o = tool.overlap(r @ R, pads.side)
-    m = (
-        np.stack([-pads.side, o.slope_b, o.slope_l], axis=1) @ R.T
-    )  # (n, 3) ∇ overlap: along the tool's normal
-    touching = o.depth > 0.0
-    kn = law.normal * pads.area_m2
+    overlap = tool.overlap((pads.X - p) @ R, pads.side)
+    k = np.flatnonzero(overlap.depth > 0.0)  # springs in contact
+    creep = _Creep.over(dt_s, law)
+    normal = _normal_forces(pads, overlap, state, k, R, p, creep)
+    rub = _friction_forces(pads, state, k, R, p, creep, friction * normal.size)
+    J = normal.stiffness + rub.stiffness
+    if rub.slipping.any():
+        J -= _slip_coupling(normal, overlap, rub, k, R, friction)
+    shear, tangential = np.zeros((len(pads), 2)), np.zeros((len(pads), 2))
+    size, slipping = np.zeros(len(pads)), np.zeros(len(pads), dtype=bool)
+    shear[k], tangential[k], size[k], slipping[k] = rub.shear.T, rub.t.T, normal.size, rub.slipping
+    stored = normal.stored_j + 0.5 * law.shear * pads.area_m2 * float(np.sum(rub.shear**2))
+    return PadForces(
+        normal.wrench + rub.wrench, J, overlap.depth, size, shear, tangential, slipping, stored
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Creep:
+    """One implicit step of the relaxing branch: force = k (instant · x − memory · x_relaxed)."""
+
+    instant: float
+    memory: float
+
+    @classmethod
+    def over(cls, dt_s: float, law: GelLaw) -> _Creep:
+        rho = dt_s / law.creep_s
+        return cls(1.0 - law.creep * rho / (1.0 + rho), law.creep / (1.0 + rho))
+
+
+@dataclass(frozen=True, slots=True)
+class _Normal:
+    """Normal forces of the k springs in contact; G (6, k) are their unit wrenches."""
+
+    wrench: FloatArray
+    stiffness: FloatArray
+    f: FloatArray
+    k_n: FloatArray
+    G: FloatArray
+    r: FloatArray
+    lean: FloatArray
+    size: FloatArray
+    stored_j: float
+
+
+def _normal_forces(
+    pads: Pads, o: Overlap, state: PadState, k: IntArray, R: FloatArray, p: FloatArray, creep: _Creep
+) -> _Normal:
+    law, kn = pads.law, pads.law.normal * pads.area_m2
+    depth, slope_b, slope_l = o.depth[k], o.slope_b[k], o.slope_l[k]
+    r = pads.X[k].T - p[:, None]  # (3, k)
+    m = R @ np.stack([-pads.side[k], slope_b, slope_l])  # (3, k) ∇ overlap: along the tool's normal
     hard = law.stiffening / law.thickness_m
-    depth = np.where(touching, o.depth, 0.0)
-    f_n = kn * (instant * depth - memory * state.depth_v + hard * depth * depth)  # (n,)
-    pressed = touching & (f_n > 0.0)
-    f_n = np.where(pressed, f_n, 0.0)
-    k_n = np.where(pressed, kn * (instant + 2.0 * hard * depth), 0.0)
-    Gn = np.concatenate([m, np.cross(r, m)], axis=1)  # (n, 6)
-    f = f_n[:, None] * m
-    F = f.sum(axis=0)
-    wrench = f_n @ Gn
-    J = -Gn.T @ (k_n[:, None] * Gn)
+    f = kn * (creep.instant * depth - creep.memory * state.depth_v[k] + hard * depth * depth)  # (k,)
+    k_n = np.where(f > 0.0, kn * (creep.instant + 2.0 * hard * depth), 0.0)
+    f = np.maximum(f, 0.0)
+    G = _wrenches(r, m)
+    J = -(G * k_n) @ G.T
     for axis, bend in ((1, o.bend_b), (2, o.bend_l)):
-        weight = f_n * bend
-        if np.any(weight):
-            e = R[:, axis]
-            Gb = np.concatenate([np.broadcast_to(e, r.shape), np.cross(r, e)], axis=1)
-            J += Gb.T @ (weight[:, None] * -Gb)
-    SF = skew(F)
-    J[:3, 3:] -= SF
-    J[3:, :3] += SF
-    J[3:, 3:] += np.eye(3) * float(np.sum(r * f)) - f.T @ r
-    # friction
-    ks = law.shear * pads.area_m2
-    a = state.q @ R.T  # (n, 3) held points relative to the tip
-    gap = a - r
-    s = np.stack([np.sum(gap * pads.ex, axis=1), np.sum(gap * pads.ey, axis=1)], axis=1)  # (n, 2)
-    holds = state.anchored & pressed
-    t = np.where(holds[:, None], -ks * (instant * s - memory * state.shear_v), 0.0)
-    m_norm = np.sqrt(1.0 + o.slope_b**2 + o.slope_l**2)
-    normal = f_n * m_norm
-    limit = friction * normal
-    size = np.sqrt(t[:, 0] ** 2 + t[:, 1] ** 2)
+        weight = f * bend[k]
+        if weight.any():
+            Gb = _wrenches(r, np.broadcast_to(R[:, axis, None], r.shape))
+            J -= (Gb * weight) @ Gb.T
+    fm = f * m
+    F = skew(fm.sum(axis=1))
+    rf = r @ fm.T  # (3, 3) Σ r fᵀ
+    J[:3, 3:] -= F
+    J[3:, :3] += F
+    J[3:, 3:] += np.eye(3) * np.trace(rf) - rf.T
+    lean = np.sqrt(1.0 + slope_b**2 + slope_l**2)
+    return _Normal(G @ f, J, f, k_n, G, r, lean, f * lean, 0.5 * kn * float(depth @ depth))
+
+
+@dataclass(frozen=True, slots=True)
+class _Friction:
+    """Friction of the k springs in contact; rows of t and shear are (x_S, y_S)."""
+
+    wrench: FloatArray
+    stiffness: FloatArray
+    t: FloatArray
+    shear: FloatArray
+    slipping: BoolArray
+    G_slip: FloatArray
+
+
+def _friction_forces(
+    pads: Pads,
+    state: PadState,
+    k: IntArray,
+    R: FloatArray,
+    p: FloatArray,
+    creep: _Creep,
+    limit: FloatArray,
+) -> _Friction:
+    ks = pads.law.shear * pads.area_m2
+    ex, ey = pads.ex[k].T, pads.ey[k].T  # (3, k)
+    a = R @ state.q[k].T  # (3, k) held points relative to the tip
+    gap = a - (pads.X[k].T - p[:, None])
+    s = np.stack([np.sum(gap * ex, axis=0), np.sum(gap * ey, axis=0)])  # (2, k)
+    relaxed = state.shear_v[k].T
+    holds = state.anchored[k] & (limit > 0.0)
+    t = np.where(holds, -ks * (creep.instant * s - creep.memory * relaxed), 0.0)
+    size = np.maximum(np.sqrt(t[0] ** 2 + t[1] ** 2), 1e-300)
     slipping = holds & (size > limit)
-    scale = np.where(slipping, limit / np.maximum(size, 1e-300), 1.0)
-    unit = t / np.maximum(size, 1e-300)[:, None]
-    t = t * scale[:, None]
-    Gx = np.concatenate([pads.ex, np.cross(a, pads.ex)], axis=1)
-    Gy = np.concatenate([pads.ey, np.cross(a, pads.ey)], axis=1)
-    wrench = wrench + t[:, 0] @ Gx + t[:, 1] @ Gy
-    stick = np.where(
-        holds, ks * instant * scale, 0.0
-    )  # tangent of the return mapping: across the slip direction
+    scale = np.where(slipping, limit / size, 1.0)
+    u = t / size
+    t = t * scale
+    Gx, Gy = _wrenches(a, ex), _wrenches(a, ey)
+    stick = np.where(holds, ks * creep.instant * scale, 0.0)  # return mapping: stiff across the slip direction
     along = np.where(slipping, stick, 0.0)
-    ux, uy = unit[:, 0], unit[:, 1]
-    J -= Gx.T @ ((stick - along * ux * ux)[:, None] * Gx) + Gy.T @ ((stick - along * uy * uy)[:, None] * Gy)
-    cross = Gx.T @ ((along * ux * uy)[:, None] * Gy)
-    J += cross + cross.T
-    if np.any(slipping):
-        Gu = ux[:, None] * Gx + uy[:, None] * Gy
-        J -= Gu.T @ (np.where(slipping, friction * m_norm * k_n, 0.0)[:, None] * Gn)
-        for axis, slope, bend in (
-            (1, o.slope_b, o.bend_b),
-            (2, o.slope_l, o.bend_l),
-        ):  # the normal's own change
-            weight = np.where(slipping, friction * f_n * slope * bend / m_norm, 0.0)
-            if np.any(weight):
-                e = R[:, axis]
-                Ge = np.concatenate([np.broadcast_to(e, r.shape), np.cross(r, e)], axis=1)
-                J -= Gu.T @ (weight[:, None] * Ge)
-    ft = t[:, :1] * pads.ex + t[:, 1:] * pads.ey
-    J[3:, 3:] += a.T @ ft - np.eye(3) * float(np.sum(a * ft))
-    shear = np.where(slipping[:, None], (memory * ks * state.shear_v - t) / (ks * instant), s)
-    shear = np.where(holds[:, None], shear, 0.0)
-    stored = 0.5 * kn * float(np.sum(depth * depth)) + 0.5 * ks * float(np.sum(shear * shear))
-    return PadForces(wrench, J, o.depth, normal, shear, t, slipping, stored)
+    J = -(Gx * (stick - along * u[0] ** 2)) @ Gx.T - (Gy * (stick - along * u[1] ** 2)) @ Gy.T
+    G_slip = np.zeros((6, 0))
+    if slipping.any():
+        cross = (Gx * (along * u[0] * u[1])) @ Gy.T
+        J += cross + cross.T
+        G_slip = u[0] * Gx + u[1] * Gy
+    af = a @ (t[0] * ex + t[1] * ey).T  # (3, 3) Σ a fᵀ
+    J[3:, 3:] += af - np.eye(3) * np.trace(af)
+    followed = (creep.memory * ks * relaxed - t) / (ks * creep.instant)
+    shear = np.where(holds, np.where(slipping, followed, s), 0.0)
+    return _Friction(Gx @ t[0] + Gy @ t[1], J, t, shear, slipping, G_slip)
+
+
+def _slip_coupling(
+    normal: _Normal, o: Overlap, rub: _Friction, k: IntArray, R: FloatArray, friction: float
+) -> FloatArray:
+    """(6, 6) how the friction of slipping springs follows their normal force and its direction."""
+    on = np.where(rub.slipping, friction, 0.0)
+    J = (rub.G_slip * (on * normal.lean * normal.k_n)) @ normal.G.T
+    for axis, slope, bend in ((1, o.slope_b, o.bend_b), (2, o.slope_l, o.bend_l)):
+        weight = on * normal.f * slope[k] * bend[k] / normal.lean
+        if weight.any():
+            Ge = _wrenches(normal.r, np.broadcast_to(R[:, axis, None], normal.r.shape))
+            J += (rub.G_slip * weight) @ Ge.T
+    return np.asarray(J)
+
+
+def _wrenches(r: FloatArray, f: FloatArray) -> FloatArray:
+    """(6, k) wrenches (f, r × f) of forces f at r, (3, k) each."""
+    G = np.empty((6, r.shape[1]))
+    G[:3] = f
+    G[3] = r[1] * f[2] - r[2] * f[1]
+    G[4] = r[2] * f[0] - r[0] * f[2]
+    G[5] = r[0] * f[1] - r[1] * f[0]
+    return G
 
 
 def advance_pads(

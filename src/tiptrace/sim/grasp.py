@@ -177,7 +177,7 @@ class Grasp:
         )
 
 
-_DONE = (1e-5) ** 2  # N²: well below the tolerance, so that a frame's residual is not the solver's luck
+_DONE = (5e-5) ** 2  # N²: well below the tolerance, so that a frame's residual is not the solver's luck
 
 
 def _merit(wrench: FloatArray) -> float:

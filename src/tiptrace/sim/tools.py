@@ -100,7 +100,8 @@ class ToolShape:
         corner: Its corners.
         width_m: Overall width, for drawing and for the mass.
         length_m: From the upper end to the lowest point of the tip.
-        bend_deg: Angle by which the lower shank leaves the gripped one, towards +x_T.
+        bend_deg: Angle by which the lower shank leaves the gripped one, towards +x_T; the paper's bent tool is
+            held with its tip behind (a tip ahead of the hand would leave the pit with a snap).
         bend_above_tip_m: Height of the bend above the tip's centre, along the gripped shank.
         density: kg/m³.
         tip_radius_m: Radius of the tip's sphere.
@@ -147,15 +148,14 @@ class ToolShape:
         """
         a = side * (y_T[:, 0] - self.shank_T[0])  # (n,) distance from the mid-plane towards the pad
         b = y_T[:, 1]
-        drop_b, first_b, second_b = self.corner.drop(np.abs(b) - 0.5 * self.flat_m)
-        end = _END_CORNER.drop(self.top_m + _END_CORNER.run_m - y_T[:, 2])  # beyond the upper end
-        return Overlap(
-            depth=0.5 * self.thickness_m - drop_b - end[0] - a,
-            slope_b=-first_b * np.sign(b),
-            slope_l=end[1],
-            bend_b=-second_b,
-            bend_l=-end[2],
-        )
+        drop, slope, bend = self.corner.drop(np.abs(b) - 0.5 * self.flat_m)
+        depth = 0.5 * self.thickness_m - drop - a
+        beyond = self.top_m + _END_CORNER.run_m - y_T[:, 2]  # past where the upper end begins to round
+        if not (beyond > 0.0).any():
+            zero = np.zeros(len(b))
+            return Overlap(depth, -slope * np.sign(b), zero, -bend, zero)
+        end = _END_CORNER.drop(beyond)
+        return Overlap(depth - end[0], -slope * np.sign(b), end[1], -bend, -end[2])
 
     def height_above_gel(self, T_S_T: FloatArray, x: FloatArray, y: FloatArray, side: float) -> FloatArray:
         """Height z_S of the tool's surface over points of the gel plane; negative where it presses in, m.
@@ -188,7 +188,7 @@ def _tool(name: str, section: str, thickness_m: float) -> ToolShape:
     if section in ("rectangular", "bent"):
         width = 7.5e-3
         tool = ToolShape(name, section, thickness_m, width - 1.2 * corner.run_m, corner, width)
-        return replace(tool, bend_deg=12.0, bend_above_tip_m=30e-3) if section == "bent" else tool
+        return replace(tool, bend_deg=-12.0, bend_above_tip_m=30e-3) if section == "bent" else tool
     if section == "hexagonal":  # a flat faces each pad; the neighbouring faces fall away at 60°
         face = thickness_m / np.sqrt(3.0)
         flat = face - corner.run_m  # half a run on either side: the flank's line then meets the flat's at the edge
