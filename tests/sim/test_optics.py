@@ -101,7 +101,7 @@ def test_ball_penetration_is_continuous() -> None:
 
 
 def test_folder_is_what_calibration_reads(tmp_path: Path) -> None:
-    plan = PressPlan(gel_seed=7, layout=DotLayout(), columns=2, rows=2)
+    plan = PressPlan(gel_seeds=(7,), layout=DotLayout(), columns=2, rows=2)
     presses = write_press_folder(tmp_path, plan)
     with (tmp_path / "presses.csv").open() as file:
         rows = list(csv.DictReader(file))
@@ -111,3 +111,13 @@ def test_folder_is_what_calibration_reads(tmp_path: Path) -> None:
         np.testing.assert_array_equal(cv2.imread(str(tmp_path / row["image"])), press.image)
         assert float(row["ball_diameter_mm"]) == pytest.approx(press.ball_diameter_m * 1e3)
         assert float(row["center_u_px"]) == pytest.approx(press.center_px[0])
+
+
+def test_presses_of_several_gels_share_one_reference(tmp_path: Path) -> None:
+    """Away from the press every image shows the reference, whichever gel it came from."""
+    plan = PressPlan(gel_seeds=(7, 8), columns=2, rows=1, depth_m=(0.5e-3, 0.6e-3))
+    presses = write_press_folder(tmp_path, plan)
+    reference = cv2.imread(str(tmp_path / "reference.png")).astype(float)
+    for press, far in zip(presses, (np.s_[:, 240:], np.s_[:, :80]), strict=True):
+        gap = (press.image.astype(float) - reference)[far].mean(axis=(0, 1))
+        np.testing.assert_allclose(gap, 0, atol=0.8)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -118,22 +118,25 @@ def _contact_radius(
 
 @dataclass(frozen=True, slots=True)
 class PressPlan:
-    """A calibration session on one gel.
+    """A calibration session.
 
     Attributes:
-        gel_seed: Gel, see :func:`tiptrace.sim.optics.gel_optics`; None is the fitted gel.
+        gel_seeds: Gels, used in turn, see :func:`tiptrace.sim.optics.gel_optics`; None is the fitted gel. A user
+            has one; the packaged network is made on several.
         layout: Dots of the gel, None for a gel without.
-        columns: Presses per row of the image, for each ball.
+        columns: Presses per row of the image.
         rows: Rows of presses.
-        ball_diameters_m: Balls, used in turn at each place.
+        rounds: How often the whole gel is covered.
+        ball_diameters_m: Balls, used in turn.
         depth_m: Shallowest and deepest press.
         seed: Where exactly and how deep.
     """
 
-    gel_seed: int | None = None
+    gel_seeds: tuple[int | None, ...] = (None,)
     layout: DotLayout | None = None
     columns: int = 8
     rows: int = 6
+    rounds: int = 1
     ball_diameters_m: tuple[float, ...] = BALL_DIAMETERS_M
     depth_m: tuple[float, float] = (0.4e-3, 1.6e-3)
     seed: int = 0
@@ -145,7 +148,8 @@ def write_press_folder(
     """Make the presses of a plan and write them as ``tiptrace calibrate gel`` reads them.
 
     The folder gets ``reference.png``, the images, and ``presses.csv`` with the columns ``image,
-    ball_diameter_mm, center_u_px, center_v_px, contact_radius_px``.
+    ball_diameter_mm, center_u_px, center_v_px, contact_radius_px``. With several gels every image is lit as the
+    first gel is (its ratio to its own reference is kept), so that one reference serves all.
 
     Args:
         folder: Created if need be.
@@ -153,21 +157,34 @@ def write_press_folder(
         progress: Called with presses done and presses in all.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    renderer = TactileRenderer(gel_optics(plan.gel_seed), plan.layout, CameraNoise(), seed=plan.seed)
-    cv2.imwrite(str(folder / "reference.png"), renderer.reference())
+    sensors = [
+        TactileRenderer(gel_optics(gel), plan.layout, CameraNoise(), seed=plan.seed + k)
+        for k, gel in enumerate(plan.gel_seeds)
+    ]
+    references = [sensor.reference() for sensor in sensors]
+    cv2.imwrite(str(folder / "reference.png"), references[0])
     rng = np.random.default_rng([plan.seed, 0xBA11])
-    places = _places(plan, renderer.size_px, rng)
+    places = [place for _ in range(plan.rounds) for place in _places(plan, sensors[0].size_px, rng)]
     presses = []
-    for index, (u, v) in enumerate(places):
-        diameter = plan.ball_diameters_m[(index + index // plan.columns) % len(plan.ball_diameters_m)]
-        depth = min(float(rng.uniform(*plan.depth_m)), 0.4 * diameter)
-        press = render_press(renderer, (u, v), diameter, depth, frame=index)
+    for index, place in enumerate(places):
+        gel = index % len(sensors)
+        diameter = float(rng.choice(plan.ball_diameters_m))
+        depth = min(float(rng.uniform(*plan.depth_m)), 0.45 * diameter)
+        press = render_press(sensors[gel], place, diameter, depth, frame=index)
+        if gel > 0:
+            press = replace(press, image=_relit(press.image, references[gel], references[0]))
         cv2.imwrite(str(folder / _name(index)), press.image)
         presses.append(press)
         if progress is not None:
             progress(index + 1, len(places))
     _write_csv(folder / "presses.csv", presses)
     return presses
+
+
+def _relit(image: Image, own_reference: Image, reference: Image) -> Image:
+    """The image with the same ratio to another reference."""
+    ratio = image.astype(np.float32) / np.maximum(own_reference, 1)
+    return np.asarray(np.clip(ratio * reference + np.float32(0.5), 0, 255).astype(np.uint8))
 
 
 def _places(plan: PressPlan, size_px: tuple[int, int], rng: np.random.Generator) -> list[tuple[float, float]]:
