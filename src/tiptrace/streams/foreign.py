@@ -80,7 +80,7 @@ class ForeignRecording:
         self._gel_models = dict(gel_models or {})
         self._stamps = stamps
         source = open_source(path)
-        self._tf = TfPoses(source, map_file.tf) if map_file.tf is not None else None
+        self._tf = TfPoses(source) if map_file.tf is not None else None
         self._reader = TrialReader(
             source,
             map_file.topics(),
@@ -145,7 +145,9 @@ class ForeignRecording:
 
     def _watch(self, raw: RawMessage) -> None:
         assert self._tf is not None
-        self._tf.add(raw)
+        assert self._map.tf is not None
+        if raw.topic in self._map.tf.topics:
+            self._tf.add(raw)
 
     def _chain_poses(self, use_log: bool) -> list[PoseSample]:
         assert self._tf is not None
@@ -160,7 +162,7 @@ class ForeignRecording:
                     f"{self.path}: the map file takes tf.{key} {said!r}, but frames.{key} of the rig file is "
                     f"{meant!r}: make them the same"
                 )
-        return self._tf.poses(use_log, trust_header=self._stamps == "header")
+        return self._tf.poses(self._map.tf, use_log, trust_header=self._stamps == "header")
 
     def _mean_images(self, start: int, stop: int) -> dict[Side, Image]:
         """Mean of frames start … stop − 1 of each side."""

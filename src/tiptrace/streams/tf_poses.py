@@ -36,16 +36,14 @@ class _Link:
 
 
 class TfPoses:
-    """Collects TF messages and composes one chain of them.
+    """Collects TF messages and composes chains of their links.
 
     Args:
         source: Decodes the messages.
-        chain: Which frames, and on which topics.
     """
 
-    def __init__(self, source: MessageSource, chain: TfChain) -> None:
+    def __init__(self, source: MessageSource) -> None:
         self._source = source
-        self._chain = chain
         self._where = f"{source.path}: TF"
         self._links: dict[str, _Link] = {}  # by child: a frame has one parent
 
@@ -55,13 +53,11 @@ class TfPoses:
         return sorted({name for link in self._links.values() for name in (link.parent, link.child)})
 
     def add(self, raw: RawMessage) -> None:
-        """Take a message if it is one of the chain's topics.
+        """Take a message.
 
         Raises:
-            RecordingError: such a topic of another type.
+            RecordingError: it is of another type.
         """
-        if raw.topic not in self._chain.topics:
-            return
         if raw.type != TF_TYPE:
             raise RecordingError(f"{self._where}: {raw.topic}: type is {raw.type}, expected {TF_TYPE}")
         for item in self._source.decode(raw).transforms:
@@ -77,38 +73,61 @@ class TfPoses:
         link.log_ns.append(raw.log_time_ns)
         link.values.extend((p.x, p.y, p.z, q.x, q.y, q.z, q.w))
 
-    def poses(self, use_log: bool, *, trust_header: bool = False) -> list[PoseSample]:
+    def connects(self, base: str, end_effector: str) -> bool:
+        """Whether there is a chain between two frames in which something moves."""
+        try:
+            return bool(self._moving(TfChain(base=base, end_effector=end_effector)))
+        except RecordingError:
+            return False
+
+    def poses(self, chain: TfChain, use_log: bool, *, trust_header: bool = False) -> list[PoseSample]:
         """T_B_E at the stamps of the chain's fastest link, in order.
+
+        Args:
+            chain: Which frames.
+            use_log: Whether the recorder's clock dates the links, and not their headers.
+            trust_header: Whether headers are used even where they differ from the recorder's clock.
 
         Raises:
             RecordingError: no such frames, no connection between them, nothing moves, or values that cannot be
                 meant; the clocks disagree and neither was chosen.
         """
-        up, down = self._path(self._chain.base), self._path(self._chain.end_effector)
-        while up and down and up[-1] is down[-1]:  # the common way to the root
-            up.pop()
-            down.pop()
-        root_base = up[-1].parent if up else self._chain.base.strip("/")
-        root_tool = down[-1].parent if down else self._chain.end_effector.strip("/")
-        if root_base != root_tool:
-            raise RecordingError(
-                f"{self._where}: {self._chain.base!r} and {self._chain.end_effector!r} are not connected; record "
-                "/tf_static too, or choose other frames in the map file"
-            )
-        moving = [link for link in (*up, *down) if not link.static]
-        if not moving:
-            raise RecordingError(
-                f"{self._where}: nothing moves between {self._chain.base!r} and {self._chain.end_effector!r}; "
-                "choose the robot's base and its flange or tool frame"
-            )
+        moving = self._moving(chain)
         if not use_log and not trust_header:
             self._check_clock(moving)
+        up, down = self._branches(chain)
         times = np.unique(_stamps(max(moving, key=lambda link: len(link.log_ns)), use_log))
         T_up, known_up = self._compose(up, times, use_log)
         T_down, known_down = self._compose(down, times, use_log)
         T_B_E = invert(T_up) @ T_down  # (n, 4, 4)
         keep = known_up & known_down
         return [PoseSample(int(t), T) for t, T, k in zip(times, T_B_E, keep, strict=True) if k]
+
+    def _branches(self, chain: TfChain) -> tuple[list[_Link], list[_Link]]:
+        """Links from the base and from the end effector up to where they meet."""
+        up, down = self._path(chain.base), self._path(chain.end_effector)
+        while up and down and up[-1] is down[-1]:  # the common way to the root
+            up.pop()
+            down.pop()
+        root_base = up[-1].parent if up else chain.base.strip("/")
+        root_tool = down[-1].parent if down else chain.end_effector.strip("/")
+        if root_base != root_tool:
+            raise RecordingError(
+                f"{self._where}: {chain.base!r} and {chain.end_effector!r} are not connected; record /tf_static "
+                "too, or choose other frames in the map file"
+            )
+        return up, down
+
+    def _moving(self, chain: TfChain) -> list[_Link]:
+        """The links of a chain that are not static."""
+        up, down = self._branches(chain)
+        moving = [link for link in (*up, *down) if not link.static]
+        if not moving:
+            raise RecordingError(
+                f"{self._where}: nothing moves between {chain.base!r} and {chain.end_effector!r}; choose the "
+                "robot's base and its flange or tool frame"
+            )
+        return moving
 
     def _path(self, frame: str) -> list[_Link]:
         """Links from a frame up to the root."""
