@@ -81,10 +81,10 @@ class TemplateFit:
             config: Noise and priors.
         """
         self._config = config
-        self._M = np.where(np.isfinite(M), M, 0.0)
-        self._trust = np.where(np.isfinite(M).all(axis=1), trust, 0.0)
-        self._pad = pad.astype(int)
-        self._g = np.average(self._M, axis=0, weights=np.maximum(self._trust, 1e-12))  # centroid
+        self._all = M
+        self._active = np.flatnonzero(np.isfinite(M).all(axis=1) & (trust > 0))  # rows in use
+        self._M, self._trust, self._pad = M[self._active], trust[self._active], pad[self._active].astype(int)
+        self._g = np.average(self._M, axis=0, weights=self._trust) if len(self._M) else np.zeros(3)  # centroid
         self._basis = axes[self._pad]  # (N, 3, 3): columns u, v, n
         self._sigma = np.array(
             [config.in_plane_sigma_m] * 2 + [np.hypot(config.depth_sigma_m, config.depth_bias_sigma_m)]
@@ -93,7 +93,7 @@ class TemplateFit:
             np.swapaxes(self._basis, 1, 2) / self._sigma[:, None]
         )  # (N, 3, 3): r_E → whitened (u, v, n)
         self._J = self._jacobian()  # (N, 3, 10) whitened
-        self._JJ = np.einsum("nij,nik->njk", self._J, self._J).reshape(len(M), 100)
+        self._JJ = np.einsum("nij,nik->njk", self._J, self._J).reshape(len(self._M), 100)
         self._prior = np.diag([0.0] * 6 + [config.tilt_sigma_rad**-2] * 4)
 
     def _jacobian(self) -> FloatArray:
@@ -104,7 +104,7 @@ class TemplateFit:
         J[:, :, :6] = self._whiten @ J_E
         for k in (0, 1):
             here = self._pad == k
-            if not (self._trust[here] > 0).any():
+            if not here.any():
                 continue
             middle = np.average(self._M[here], axis=0, weights=self._trust[here])
             uv = np.einsum("nij,ni->nj", self._basis[here], self._M[here] - middle)[
@@ -116,7 +116,7 @@ class TemplateFit:
     @property
     def template(self) -> FloatArray:
         """(N, 3) in F_E, m."""
-        return self._M
+        return self._all
 
     def fit(self, X: FloatArray, start: tuple[FloatArray, FloatArray] | None = None) -> Motions:
         """Motions of T frames.
@@ -125,8 +125,9 @@ class TemplateFit:
             X: (T, N, 3) markers in F_E, m, NaN where lost.
             start: Initial R (T, 3, 3) and t (T, 3); None: no motion.
         """
+        X = X[:, self._active]
         T, N = X.shape[:2]
-        seen = np.isfinite(X[..., 0]) & (self._trust > 0)  # (T, N)
+        seen = np.isfinite(X[..., 0])  # (T, N)
         X = np.where(seen[..., None], X, 0.0)
         base: FloatArray = seen.astype(np.float64) * self._trust
         R = np.tile(np.eye(3), (T, 1, 1)) if start is None else start[0]
@@ -149,7 +150,8 @@ class TemplateFit:
     def _whitened_residual(self, X: FloatArray, R: FloatArray, t: FloatArray) -> FloatArray:
         """(T, N, 3) in the pads' axes over their sigmas."""
         y = self._M @ np.swapaxes(R, 1, 2) + t[:, None]
-        return np.asarray(np.einsum("nij,tnj->tni", self._whiten, X - y))
+        r = (X - y)[..., None, :]  # (T, N, 1, 3)
+        return np.asarray((r @ np.swapaxes(self._whiten, 1, 2))[..., 0, :])
 
     def _result(
         self,
@@ -170,10 +172,16 @@ class TemplateFit:
             covariance=np.asarray(covariance, dtype=np.float64),
             centre=R @ self._g + t,
             residual_m=np.sqrt(in_plane) * self._sigma[0],
-            weights=weights,
+            weights=self._scatter(weights),
             chi2=chi2,
             sides=np.stack([base @ (self._pad == 0), base @ (self._pad == 1)], axis=1),
         )
+
+    def _scatter(self, values: FloatArray) -> FloatArray:
+        """(T, active) → (T, N), 0 elsewhere."""
+        full = np.zeros((len(values), len(self._all)))
+        full[:, self._active] = values
+        return full
 
     def refined_template(self, X: FloatArray, motions: Motions) -> FloatArray:
         """Mean of the frames carried back to the template, (N, 3); markers never seen stay."""
@@ -181,4 +189,4 @@ class TemplateFit:
         seen = motions.weights + 1e-9 * np.isfinite(X[..., 0])
         total = seen.sum(axis=0)  # (N,)
         mean = np.einsum("tn,tni->ni", seen, back) / np.maximum(total, 1e-12)[:, None]
-        return np.asarray(np.where(total[:, None] > 0, mean, self._M))
+        return np.asarray(np.where(total[:, None] > 0, mean, self._all))

@@ -6,7 +6,6 @@ there; a local quadratic through a window of samples has no such preference.
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -40,35 +39,47 @@ class PoseTrack:
 
     def __init__(self, memory_s: float = 1.0, half_width_s: float = 0.05) -> None:
         self._memory_ns, self._half_s = int(memory_s * 1e9), half_width_s
-        self._samples: deque[PoseSample] = deque()
-        self._stamps: FloatArray = np.zeros(0)
-        self._T: FloatArray = np.zeros((0, 4, 4))
-        self._stale = False
+        self._stamps: FloatArray = np.zeros(64)  # ns; the first _size rows hold samples, in order
+        self._T: FloatArray = np.zeros((64, 4, 4))
+        self._size = 0
 
     def __len__(self) -> int:
-        return len(self._samples)
+        return self._size
 
     @property
     def newest_ns(self) -> int | None:
         """Stamp of the last sample."""
-        return self._samples[-1].stamp_ns if self._samples else None
+        return int(self._stamps[self._size - 1]) if self._size else None
 
     def extend(self, samples: Iterable[PoseSample]) -> None:
         """Take in samples, in order; those that step back in time are left out, old ones forgotten."""
         for sample in samples:
-            if self._samples and sample.stamp_ns <= self._samples[-1].stamp_ns:
+            if self._size and sample.stamp_ns <= self._stamps[self._size - 1]:
                 continue
-            self._samples.append(sample)
-            self._stale = True
-        while self._samples and self._samples[0].stamp_ns < self._samples[-1].stamp_ns - self._memory_ns:
-            self._samples.popleft()
+            if self._size == len(self._stamps):
+                self._make_room(sample.stamp_ns)
+            self._stamps[self._size], self._T[self._size] = sample.stamp_ns, sample.T_B_E
+            self._size += 1
+
+    def _make_room(self, now_ns: int) -> None:
+        """Forget what is older than the memory; grow while the memory holds more."""
+        first = int(np.searchsorted(self._stamps[: self._size], now_ns - self._memory_ns))
+        kept = self._size - first
+        capacity = max(64, 2 * kept)
+        stamps, T = np.zeros(capacity), np.zeros((capacity, 4, 4))
+        stamps[:kept], T[:kept] = self._stamps[first : self._size], self._T[first : self._size]
+        self._stamps, self._T, self._size = stamps, T, kept
 
     def covers(self, stamp_ns: float) -> bool:
         """Whether there are samples about an instant."""
-        return (
-            len(self._samples) >= _FEWEST
-            and self._samples[0].stamp_ns <= stamp_ns <= self._samples[-1].stamp_ns + 5e6
-        )
+        if self._size < _FEWEST:
+            return False
+        return bool(self._stamps[0] <= stamp_ns <= self._stamps[self._size - 1] + 5e6)
+
+    def gap_s(self, stamp_ns: float) -> float:
+        """Distance between the samples on either side of an instant, s."""
+        k = int(np.clip(np.searchsorted(self._stamps[: self._size], stamp_ns), 1, max(self._size - 1, 1)))
+        return float(self._stamps[k] - self._stamps[k - 1]) * 1e-9
 
     def at(self, stamps_ns: ArrayLike) -> HandStates:
         """Smoothed hand at instants (T,), ns.
@@ -76,17 +87,12 @@ class PoseTrack:
         Raises:
             GeometryError: fewer than four samples in memory.
         """
-        if len(self._samples) < _FEWEST:
+        if self._size < _FEWEST:
             raise GeometryError(
-                f"the pose stream has {len(self._samples)} samples in memory, at least 4 are needed"
+                f"the pose stream has {self._size} samples in memory, at least {_FEWEST} are needed"
             )
-        if self._stale:
-            self._stamps = np.array([s.stamp_ns for s in self._samples], dtype=np.float64)
-            self._T = np.array([s.T_B_E for s in self._samples])
-            self._stale = False
-        return smooth_at(
-            self._stamps, self._T, np.atleast_1d(np.asarray(stamps_ns, dtype=np.float64)), self._half_s
-        )
+        at = np.atleast_1d(np.asarray(stamps_ns, dtype=np.float64))
+        return smooth_at(self._stamps[: self._size], self._T[: self._size], at, self._half_s)
 
 
 def smooth_at(stamps_ns: FloatArray, T_B_E: FloatArray, at_ns: FloatArray, half_s: float) -> HandStates:

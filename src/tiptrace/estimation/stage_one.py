@@ -115,7 +115,7 @@ class StageOne:
         stamps, fit, weights, motions = self._fit_template()
         duration = max((stamps[-1] - stamps[0]) * 1e-9, 1e-3)
         phase = (stamps - stamps[0]) * 1e-9 / duration - 1.0
-        good: BoolArray = np.asarray(motions.sides.min(axis=1) > 0)
+        good: BoolArray = motions.sides[:, 0] * motions.sides[:, 1] > 0
         if good.sum() < 3:
             raise GeometryError("Stage I has fewer than 3 frames with markers on both fingers")
         motions, kept = _select(motions, good), stamps[good]
@@ -127,7 +127,8 @@ class StageOne:
         def hand_at(latency_s: float) -> HandStates:
             return smooth_at(track, T, kept - latency_s * 1e9, self._half_s)
 
-        tip_map = solve_tip_map(motions, hand_at, phase[good], duration, self._tip_map, latency, prior)
+        normal = self._frames[-1][1].axes[0, :, 2]
+        tip_map = solve_tip_map(motions, hand_at, phase[good], duration, self._tip_map, latency, prior, normal)
         return Anchoring(tip_map, fit, weights, kept, motions, hand_at(tip_map.latency_s), int(stamps[0]))
 
     def _fit_template(self) -> tuple[FloatArray, TemplateFit, FloatArray, Motions]:
@@ -151,10 +152,10 @@ class StageOne:
 def _first_seen(X: FloatArray) -> FloatArray:
     """Mean of the first frames in which each marker is seen, (T, N, 3) → (N, 3)."""
     head = X[: max(1, min(5, len(X)))]
-    seen = np.isfinite(head[..., 0])
+    seen: BoolArray = np.isfinite(head[..., 0])
     total = np.maximum(seen.sum(axis=0), 1)[:, None]
     M = np.where(seen[..., None], head, 0.0).sum(axis=0) / total
-    return np.asarray(np.where(seen.any(axis=0)[:, None], M, np.nan))
+    return np.asarray(np.where(np.any(seen, axis=0).reshape(-1, 1), M, np.nan))
 
 
 def _select(m: Motions, good: BoolArray) -> Motions:

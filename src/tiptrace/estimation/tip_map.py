@@ -24,6 +24,7 @@ from tiptrace.types import BoolArray, FloatArray
 C, P, G_, TAU, DRIFT = slice(0, 3), slice(3, 6), slice(6, 15), slice(15, 16), slice(16, 19)
 _SIZE = 19
 _I9 = np.eye(3).ravel()
+_DIAGONAL = _I9 > 0
 
 
 class TipMapConfig(BaseModel):
@@ -34,11 +35,13 @@ class TipMapConfig(BaseModel):
     learn_map: bool = True
     map_sigma: float = Field(default=0.10, gt=0)
     map_off_diagonal_sigma: float = Field(default=0.06, gt=0)
+    map_shear_correlation: float = Field(default=0.8, ge=0, lt=1)  # of the two axes along the pads
     map_gate_m: float = Field(default=1e-3, gt=0)  # standard deviation of the enforced motion along an axis
     latency_s: float = 0.050  # where the rig says nothing
     latency_std_s: float = Field(default=0.030, gt=0)
     latency_gate_s: float = Field(default=0.010, gt=0)
-    drift_sigma_m: float = Field(default=3e-3, gt=0)
+    drift_sigma_m: float = Field(default=3e-3, gt=0)  # along the pads
+    drift_normal_sigma_m: float = Field(default=3e-4, gt=0)  # across them, where the tool cannot slip
     drift_evidence: float = Field(default=3.0, gt=0)  # sigmas
     pose_sigma_m: float = Field(default=4e-5, gt=0)  # of the tip through the smoothed hand pose
     model_sigma_m: float = Field(default=5e-5, gt=0)  # what a linear map leaves
@@ -108,6 +111,7 @@ def solve_tip_map(
     config: TipMapConfig,
     latency: tuple[float, float] | None = None,
     prior: TipPrior | None = None,
+    normal_E: FloatArray | None = None,
 ) -> TipMap:
     """Tip, map, latency and drift from Stage I.
 
@@ -119,17 +123,19 @@ def solve_tip_map(
         config: Priors and gates.
         latency: Calibrated (mean, std) in s, where there is one.
         prior: Known tip in F_E.
+        normal_E: (3,) closing axis in F_E; None: x.
 
     Raises:
         GeometryError: fewer than 3 frames.
     """
-    solver = _Solver(
-        motions, hand_at, phase, config, latency or (config.latency_s, config.latency_std_s), prior
-    )
+    normal = np.array([1.0, 0.0, 0.0]) if normal_E is None else normal_E
+    latency = latency or (config.latency_s, config.latency_std_s)
+    solver = _Solver(motions, hand_at, phase, config, latency, prior, normal)
     theta = solver.start()
     free = np.ones(_SIZE, dtype=bool)
     free[DRIFT] = False
-    free[G_] = np.tile(solver.moved(theta) > config.map_gate_m, 3) & config.learn_map
+    learned_column = solver.moved(theta) > config.map_gate_m
+    free[G_] = (np.tile(learned_column, 3) | _DIAGONAL) & config.learn_map & bool(learned_column.any())
     best = solver.solve(theta, free)
     if latency_too_vague(best, config):
         free[TAU] = False
@@ -173,16 +179,20 @@ class _Solver:
         config: TipMapConfig,
         latency: tuple[float, float],
         prior: TipPrior | None,
+        normal: FloatArray,
     ) -> None:
         self._m, self._hand_at, self._phase, self._config = motions, hand_at, phase, config
         self._latency, self._prior = latency, prior
         self._mean = np.concatenate([np.zeros(6), _I9, [latency[0]], np.zeros(3)])
-        off = config.map_off_diagonal_sigma
-        sigma_G = np.where(np.eye(3) > 0, config.map_sigma, off).ravel()
-        self._sigma = np.concatenate(
-            [np.full(6, np.inf), sigma_G, [latency[1]], np.full(3, config.drift_sigma_m)]
+        self._prior_P = np.zeros((_SIZE, _SIZE))  # of what has a prior; c and p have none here
+        self._prior_P[G_, G_] = _map_prior(config, normal)
+        self._prior_P[TAU, TAU] = latency[1] ** 2
+        across = np.outer(normal, normal)
+        self._prior_P[DRIFT, DRIFT] = (
+            config.drift_sigma_m**2 * (np.eye(3) - across) + config.drift_normal_sigma_m**2 * across
         )
-        self._prior_N = np.diag(self._sigma**-2)
+        self._prior_N = np.zeros((_SIZE, _SIZE))
+        self._prior_N[6:, 6:] = np.linalg.inv(self._prior_P[6:, 6:])
         if prior is not None:
             self._mean[C] = prior.c
             self._prior_N[C, C] = np.linalg.inv(prior.covariance)
@@ -277,14 +287,14 @@ class _Solver:
         N = np.einsum("tij,tik->jk", A, weights[:, None, None] * (S_inv @ A), optimize=True) / factor
         N[C, C] -= self._spurious(S_inv, weights) / factor
         N += self._prior_N
-        f, h = np.flatnonzero(free), np.flatnonzero(~free & np.isfinite(self._sigma))
-        h = h[h < 16]  # a drift that no evidence speaks for is not considered
+        f, h = np.flatnonzero(free), np.flatnonzero(~free)
+        h = h[(h >= 6) & (h < 16)]  # a drift that no evidence speaks for is not considered
         P_ff = _scaled_inverse(N[np.ix_(f, f)])
         covariance = np.zeros((_SIZE, _SIZE))
         covariance[np.ix_(f, f)] = P_ff
         if len(h):
             K = -P_ff @ N[np.ix_(f, h)]
-            P_h = np.diag(self._sigma[h] ** 2)
+            P_h = self._prior_P[np.ix_(h, h)]
             covariance[np.ix_(f, f)] += K @ P_h @ K.T
             covariance[np.ix_(f, h)] = K @ P_h
             covariance[np.ix_(h, f)] = P_h @ K.T
@@ -297,6 +307,16 @@ class _Solver:
         K = skew(np.eye(3))
         E = np.einsum("tmn,mki,tkl,nlj->tij", self._m.covariance[:, :3, :3], K, S_inv, K, optimize=True)
         return np.asarray(np.einsum("t,tki,tkl,tlj->ij", weights, self._m.R, E, self._m.R, optimize=True))
+
+
+def _map_prior(config: TipMapConfig, normal: FloatArray) -> FloatArray:
+    """Covariance (9, 9) of G, row-major: what the gel shows along the two axes in the pads' plane is alike."""
+    basis = np.linalg.svd(normal[None])[2]  # rows: normal, two axes along the pads
+    sigma = np.where(np.eye(3) > 0, config.map_sigma, config.map_off_diagonal_sigma).ravel()
+    P = np.diag(sigma**2)
+    P[4, 8] = P[8, 4] = config.map_shear_correlation * config.map_sigma**2
+    turn = np.kron(basis.T, basis.T)  # G_E = basisᵀ G_pad basis
+    return np.asarray(turn @ P @ turn.T)
 
 
 def _scaled_inverse(N: FloatArray) -> FloatArray:
