@@ -13,6 +13,7 @@ from tiptrace.sim.gel import (
     deform,
     spline_basis,
     spline_coefficients,
+    unseen_gel,
     untouched,
 )
 from tiptrace.sim.presses import ball_penetration
@@ -144,6 +145,15 @@ def test_a_softer_skirt_reaches_farther() -> None:
         deform(contact, parameters=GelParameters(skirt_m=s)).height_m.mean() for s in (0.5e-3, 1.2e-3)
     )
     assert far < near
+
+
+def test_an_incompressible_gel_bulges_beside_the_contact_and_not_in_it() -> None:
+    plain, bulging = deform(bar_contact()), deform(bar_contact(), parameters=unseen_gel(3))
+    x = GEL_GRID.x_m
+    row = bulging.height_m[38]
+    assert row[(x > 6e-3) & (x < 9e-3)].max() > 5e-6
+    inside = np.abs(x) < 3.4e-3
+    np.testing.assert_allclose(row[inside], plain.height_m[38][inside], atol=2e-6)
 
 
 def test_sampling_reproduces_cubics_and_their_slopes() -> None:

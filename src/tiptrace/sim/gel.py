@@ -108,6 +108,7 @@ class GelParameters:
         coating_m: Radius over which it rounds the rim of the contact.
         shear_decay_m: Distance over which tangential displacement dies out beside the contact.
         follow_m: Reach of a contact node's displacement inside the contact (about the nodes' pitch).
+        bulge: Share of the displaced gel that rises beside the contact, over about its thickness.
     """
 
     thickness_m: float = 4e-3
@@ -118,6 +119,18 @@ class GelParameters:
     coating_m: float = 0.1e-3
     shear_decay_m: float = 2.5e-3
     follow_m: float = 1.0e-3
+    bulge: float = 0.0
+
+
+def unseen_gel(seed: int) -> GelParameters:
+    """A gel of another law: nearly incompressible, so that it bulges beside a contact, and of other stiffness."""
+    rng = np.random.default_rng([seed, 0x6E15])
+    return GelParameters(
+        skirt_m=float(rng.uniform(0.55e-3, 0.75e-3)),
+        tail_weight=0.0,
+        shear_decay_m=float(rng.choice([rng.uniform(1.2e-3, 1.7e-3), rng.uniform(3.5e-3, 4.5e-3)])),
+        bulge=float(rng.uniform(0.15, 0.3)),
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,7 +191,10 @@ def deform(
         return replace(untouched(grid, gel), contact=contact)
     depth = _drape(_round_edges(overlap, gel.rounding_m / grid.pitch_m), grid.pitch_m, gel)
     engaged = _spread(_coverage(overlap), grid.pitch_m, gel.shear_decay_m)
-    return GelDeformation(grid, -depth, engaged, contact, gel)
+    height = -depth
+    if gel.bulge > 0:
+        height += np.float32(gel.bulge) * (1 - engaged) * _blur(depth, 0.6 * gel.thickness_m / grid.pitch_m)
+    return GelDeformation(grid, height, engaged, contact, gel)
 
 
 def _round_edges(overlap: Float32Array, radius_cells: float) -> Float32Array:
