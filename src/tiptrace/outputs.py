@@ -19,6 +19,7 @@ import json
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -124,6 +125,40 @@ def read_csv(path: Path) -> list[TipEstimate]:
     if missing:
         raise OutputError(f"{path}: lacks the column(s) {', '.join(missing)}; expected {', '.join(COLUMNS)}")
     return list(_estimates(path, rows))
+
+
+def read_tum(path: Path) -> list[TipEstimate]:
+    """Positions and orientations of a TUM file; phase and status are not in it: all rows count as usable.
+
+    Raises:
+        OutputError: the file cannot be read, or a line is not ``t x y z qx qy qz qw``.
+    """
+    estimates = []
+    for number, line in enumerate(_load_text(path).splitlines(), start=1):
+        cells = line.split("#")[0].replace(",", " ").split()
+        if not cells:
+            continue
+        try:
+            if len(cells) != 8:
+                raise ValueError(f"{len(cells)} numbers instead of 8")
+            numbers = np.array([float(c) for c in cells[1:]])  # x y z qx qy qz qw
+            stamp = int(Decimal(cells[0]).scaleb(9).to_integral_value())
+            R = rotation_from_quaternion(numbers[3:])
+        except (ValueError, ArithmeticError, GeometryError) as error:
+            raise OutputError(f"{path}, line {number}: not `t x y z qx qy qz qw` ({error})") from None
+        estimates.append(TipEstimate(stamp, None, Status.OK, p_B=numbers[:3], R_B_E=R))
+    return estimates
+
+
+def read_any(path: Path) -> list[TipEstimate]:
+    """Estimates of a results folder, a ``trajectory.csv`` or a TUM file.
+
+    Raises:
+        OutputError: see the reader of each.
+    """
+    if path.is_dir():
+        return read_csv(path / CSV)
+    return read_csv(path) if path.suffix == ".csv" else read_tum(path)
 
 
 def _estimates(path: Path, rows: Iterable[dict[str, str]]) -> Iterator[TipEstimate]:
