@@ -128,4 +128,4 @@ class MarkerSensor:
         measured = x_S * [self.scale[0], self.scale[1], n.shown_depth]
         measured = measured + white
         measured[:, 2] += self._bias + x_S[:, :2] @ self._tilt
-        return measured
+        return np.asarray(measured)

@@ -233,36 +233,36 @@ class Groove:
 
     def gap(self, p: FloatArray) -> Gap:
         """Distance of the point p (3,) in plate coordinates from the solid, with derivatives."""
-        x, l, grad_l, hess_l, grad_x, hess_x = self._foot(float(p[0]), float(p[1]))
+        x, lat, grad_l, hess_l, grad_x, hess_x = self._foot(float(p[0]), float(p[1]))
         z, r = float(p[2]), self.radius_m
-        sign = 1.0 if l >= 0 else -1.0
+        sign = 1.0 if lat >= 0 else -1.0
         if z > 0.0:
-            if abs(l) >= r:
-                return Gap(z, _EZ, np.zeros((3, 3)), l, x, "plate")
-            u = r - abs(l)
+            if abs(lat) >= r:
+                return Gap(z, _EZ, np.zeros((3, 3)), lat, x, "plate")
+            u = r - abs(lat)
             distance = float(np.hypot(u, z))
             grad_u = -sign * grad_l
             gradient = (u * grad_u + z * _EZ) / distance
             hessian = (
                 np.outer(grad_u, grad_u) + _EZZ - u * sign * hess_l - np.outer(gradient, gradient)
             ) / distance
-            return Gap(distance, gradient, hessian, l, x, "edge")
+            return Gap(distance, gradient, hessian, lat, x, "edge")
         z_c, z_c1, z_c2 = self.pit.at(x)
         zeta = z - z_c
         if zeta >= 0.0:  # between the lowered axis and the plate the walls are upright
-            return Gap(r - abs(l), -sign * grad_l, -sign * hess_l, l, x, "wall")
-        rho = max(float(np.hypot(l, zeta)), 1e-9)
+            return Gap(r - abs(lat), -sign * grad_l, -sign * hess_l, lat, x, "wall")
+        rho = max(float(np.hypot(lat, zeta)), 1e-9)
         grad_z = _EZ - z_c1 * grad_x
         hess_z = -z_c2 * np.outer(grad_x, grad_x) - z_c1 * hess_x
-        gradient = (l * grad_l + zeta * grad_z) / rho
-        hessian = np.outer(grad_l, grad_l) + l * hess_l + np.outer(grad_z, grad_z) + zeta * hess_z
+        gradient = (lat * grad_l + zeta * grad_z) / rho
+        hessian = np.outer(grad_l, grad_l) + lat * hess_l + np.outer(grad_z, grad_z) + zeta * hess_z
         hessian = (hessian - np.outer(gradient, gradient)) / rho
-        return Gap(r - rho, -gradient, -hessian, l, x, "floor")
+        return Gap(r - rho, -gradient, -hessian, lat, x, "floor")
 
     def _foot(
         self, px: float, py: float
     ) -> tuple[float, float, FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Foot point x, signed lateral distance l, and gradients and Hessians (3-D) of l and x."""
+        """Foot point x, signed lateral distance lat, and gradients and Hessians (3-D) of lat and x."""
         x = px
         for _ in range(30):
             f, f1, f2, _ = self.line.at(x)
@@ -275,17 +275,17 @@ class Groove:
         f, f1, f2, f3 = self.line.at(x)
         v = float(np.hypot(1.0, f1))
         tau, nu = np.array([1.0, f1, 0.0]) / v, np.array([-f1, 1.0, 0.0]) / v
-        l = (px - x) * nu[0] + (py - f) * nu[1]
+        lat = (px - x) * nu[0] + (py - f) * nu[1]
         kappa = f2 / v**3
         kappa1 = f3 / v**3 - 3.0 * f1 * f2 * f2 / v**5  # dκ/dx
-        s = max(1.0 - kappa * l, 0.05)
+        s = max(1.0 - kappa * lat, 0.05)
         w = v * s
         hess_l = -kappa / s * np.outer(tau, tau)
         grad_x = tau / w
-        dw_dx = f1 * f2 / v * s - v * kappa1 * l
+        dw_dx = f1 * f2 / v * s - v * kappa1 * lat
         hess_x = (
             kappa * v * np.outer(nu, grad_x) / w
             - dw_dx / w**2 * np.outer(tau, grad_x)
             + v * kappa / w**2 * np.outer(tau, nu)
         )
-        return x, float(l), nu, hess_l, grad_x, hess_x
+        return x, float(lat), nu, hess_l, grad_x, hess_x

@@ -27,6 +27,7 @@ from tiptrace.types import (
     PoseSample,
     Sample,
     Side,
+    TactileSample,
     TruthSample,
 )
 
@@ -42,12 +43,14 @@ class Frame:
     Attributes:
         state: The physics.
         markers_S: True dots (n, 3) in F_S by side, m.
-        samples: What the sensors deliver of it; empty where the pair was lost.
+        samples: What the sensors deliver since the frame before.
+        stamps_ns: Stamps of its two tactile samples; empty where the pair was lost.
     """
 
     state: FrameState
     markers_S: dict[Side, FloatArray]
     samples: tuple[Sample, ...]
+    stamps_ns: dict[Side, int]
 
 
 @dataclass(slots=True)
@@ -122,31 +125,30 @@ class Simulation:
         """
         T_last: FloatArray | None = None
         t_last = -_LEAD_S
-        yield_from_start = [self._phase(0.0, Phase.ANCHORING)] if self.spec.anchoring_s > 0 else []
         for state in self.physics.frames():
             before = T_last if T_last is not None else state.T_B_E
-            samples: list[Sample] = list(yield_from_start)
-            yield_from_start = []
-            samples += self._poses(before, state.T_B_E, t_last, state.t_s)
+            samples: list[Sample] = self._poses(before, state.T_B_E, t_last, state.t_s)
             samples += self._marks(t_last, state.t_s)
             samples.append(TruthSample(_ns(state.t_s), state.tip_B))
             markers, tactile = self._tactile(state)
             samples += tactile
             if state.index == self.frame_count - 1:
                 samples += self._poses(state.T_B_E, state.T_B_E, state.t_s, state.t_s + _LEAD_S)
-                samples.append(self._phase(state.t_s + 0.5 / self.spec.fps, Phase.END))
+                end = state.t_s + self.spec.disturbed_by.latency_s + 0.5 / self.spec.fps
+                samples.append(PhaseSample(_ns(end), Phase.END))
             T_last, t_last = state.T_B_E, state.t_s
-            yield Frame(state, markers, tuple(samples))
+            stamps: dict[Side, int] = {s.side: s.stamp_ns for s in tactile}
+            yield Frame(state, markers, tuple(samples), stamps)
 
     # --- sensors --------------------------------------------------------------------------------------------
 
-    def _tactile(self, state: FrameState) -> tuple[dict[Side, FloatArray], list[Sample]]:
+    def _tactile(self, state: FrameState) -> tuple[dict[Side, FloatArray], list[TactileSample]]:
         """True dots, and the two tactile samples (none where the pair is lost)."""
         d = self.spec.disturbed_by
         lost, repeat, jitter = self._timing.random(), self._timing.random(2), self._timing.normal(size=2)
         frozen = abs(state.t_s - 0.6 * self.duration_s) < 0.5 * d.frozen_s
         markers: dict[Side, FloatArray] = {}
-        samples: list[Sample] = []
+        samples: list[TactileSample] = []
         for k, side in enumerate(SIDES):
             gel = self.gels[side]
             deformation = gel.deformation(state)
@@ -182,15 +184,14 @@ class Simulation:
         """Phase changes and openings in (t_0, t_1]."""
         samples: list[Sample] = []
         start = self.spec.anchoring_s
+        if start > 0.0 and t_0 < 0.0:
+            samples.append(PhaseSample(_ns(0.0), Phase.ANCHORING))
         if t_0 < start <= t_1 or (start == 0.0 and t_0 < 0.0):
-            samples.append(self._phase(start, Phase.RECONSTRUCTION))
+            samples.append(PhaseSample(_ns(start), Phase.RECONSTRUCTION))
         opening = true_opening_m(self.spec, self.physics.tool) + self.spec.disturbed_by.opening_m
         first, last = int(np.floor(t_0 * _OPENING_HZ + 1e-9)) + 1, int(np.floor(t_1 * _OPENING_HZ + 1e-9))
         samples += [OpeningSample(_ns(k / _OPENING_HZ), opening) for k in range(first, last + 1)]
         return samples
-
-    def _phase(self, t: float, phase: Phase) -> Sample:
-        return PhaseSample(_ns(t), phase)
 
     # --- truth ----------------------------------------------------------------------------------------------
 

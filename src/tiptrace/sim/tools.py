@@ -47,7 +47,9 @@ class Corner:
         """See :class:`Drop`; the curvature is a raised cosine."""
         L, w = self.run_m, 2.0 * np.pi / self.run_m
         v = np.clip(u, 0.0, L)
-        g = self.slope / L * (0.5 * v * v - (1.0 - np.cos(w * v)) / w**2) + self.slope * np.maximum(u - L, 0.0)
+        g = self.slope / L * (0.5 * v * v - (1.0 - np.cos(w * v)) / w**2) + self.slope * np.maximum(
+            u - L, 0.0
+        )
         return g, self.slope / L * (v - np.sin(w * v) / w), self.slope / L * (1.0 - np.cos(w * v))
 
 
@@ -66,7 +68,11 @@ class Round:
         r, u_c = self.radius_m, self.radius_m * _FLANK_SLOPE / float(np.hypot(1.0, _FLANK_SLOPE))
         v = np.clip(u, 0.0, u_c)
         root = np.sqrt(r * r - v * v)
-        return r - root + _FLANK_SLOPE * np.maximum(u - u_c, 0.0), v / root, np.where(u < u_c, r * r / root**3, 0.0)
+        return (
+            r - root + _FLANK_SLOPE * np.maximum(u - u_c, 0.0),
+            v / root,
+            np.where(u < u_c, r * r / root**3, 0.0),
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,7 +143,8 @@ class ToolShape:
     @property
     def centre_of_mass_T(self) -> FloatArray:
         """(3,) centre of mass, m."""
-        return self.shank_T * 0.8 + np.array([0.0, 0.0, 0.5 * (self.top_m + self.tip_radius_m)])
+        middle = np.array([0.0, 0.0, 0.5 * (self.top_m + self.tip_radius_m)])
+        return np.asarray(self.shank_T * 0.8 + middle)
 
     def overlap(self, y_T: FloatArray, side: FloatArray) -> Overlap:
         """Overlap of gel points with the half of the tool that faces their pad.
@@ -191,7 +198,9 @@ def _tool(name: str, section: str, thickness_m: float) -> ToolShape:
         return replace(tool, bend_deg=-12.0, bend_above_tip_m=30e-3) if section == "bent" else tool
     if section == "hexagonal":  # a flat faces each pad; the neighbouring faces fall away at 60°
         face = thickness_m / np.sqrt(3.0)
-        flat = face - corner.run_m  # half a run on either side: the flank's line then meets the flat's at the edge
+        flat = (
+            face - corner.run_m
+        )  # half a run on either side: the flank's line then meets the flat's at the edge
         return ToolShape(name, section, thickness_m, flat, corner, 2 * face)
     return ToolShape(name, section, thickness_m, 0.0, Round(0.5 * thickness_m), thickness_m)
 

@@ -18,7 +18,7 @@ from tiptrace.sim.rig import PADS_E, Placement, true_opening_m, true_rig
 from tiptrace.sim.slip import SlipMeter, drift_anchors
 from tiptrace.sim.spec import TrialSpec
 from tiptrace.sim.tools import ToolShape, make_tool
-from tiptrace.types import SIDES, FloatArray
+from tiptrace.types import SIDES, FloatArray, Phase
 
 PLATE_ORIGIN_B = np.array([0.35, -0.15, 0.02])
 MAX_STEP_S = 0.02
@@ -37,6 +37,7 @@ class FrameState:
     Attributes:
         index: Frame number.
         t_s: Exposure time since the trial's start.
+        phase: Segment of the trial.
         T_B_E: (4, 4) hand.
         T_E_T: (4, 4) tool in the hand.
         pads: Forces of the pads.
@@ -52,6 +53,7 @@ class FrameState:
 
     index: int
     t_s: float
+    phase: Phase
     T_B_E: FloatArray
     T_E_T: FloatArray
     pads: PadForces
@@ -158,7 +160,11 @@ class TrialPhysics:
         force = lowered = 0.0
         stiffness = 3e3
         while force < wanted - 0.01:
-            step = _PRESS_STEP_M if force < 0.3 else float(np.clip((wanted - force) / stiffness, 1e-6, _PRESS_STEP_M))
+            step = (
+                _PRESS_STEP_M
+                if force < 0.3
+                else float(np.clip((wanted - force) / stiffness, 1e-6, _PRESS_STEP_M))
+            )
             T[2, 3] -= step
             lowered += step
             self._to_equilibrium(World(T.copy(), mu), 0.05, "pressing down")
@@ -245,7 +251,9 @@ class TrialPhysics:
         if not self._anchored:
             self._plan_rise(segment.from_m)
         u = (t - moving_until) / segment.rest_s
-        self._guard_m = self._guard_end_m + (self._travel_rise_m - self._guard_end_m) * u * u * (3.0 - 2.0 * u)
+        self._guard_m = self._guard_end_m + (self._travel_rise_m - self._guard_end_m) * u * u * (
+            3.0 - 2.0 * u
+        )
 
     def _plan_rise(self, travelled_m: float) -> None:
         """Decide on the height of the travel: from the force now to the preload, and out of the pit."""
@@ -323,6 +331,7 @@ class TrialPhysics:
         return FrameState(
             index=index,
             t_s=t,
+            phase=self.hand.phase(t),
             T_B_E=T_B_E,
             T_E_T=transform(e.R, e.p),
             pads=e.pads,
