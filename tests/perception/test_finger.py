@@ -80,7 +80,7 @@ def test_bad_images_are_refused(image, message):
 
 def test_the_message_names_the_finger():
     finger = Finger(SENSOR, linear_gel(), gel_image(), PAPER, side="left")
-    with pytest.raises(PerceptionError, match="^left finger: tactile image is black"):
+    with pytest.raises(PerceptionError, match=r"^left finger: tactile image is black"):
         finger.sense(np.zeros((H, W, 3), np.uint8))
 
 

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tiptrace.perception.background import untouched_background
 from tiptrace.perception.fill import nearest_fill
 from tiptrace.perception.gel_model import GelModel
 from tiptrace.perception.markers import check_image
@@ -57,7 +58,7 @@ class PaperDepth:
         self._gel, self._threshold = gel, marker_threshold
         v, u = np.indices((H, W), dtype=np.float32)
         self._unit_uv = np.stack([u / W, v / H], axis=-1).reshape(-1, 2)  # (HW, 2)
-        self._reference = reference.astype(np.float32)
+        self._background = untouched_background(reference)
         self._solver = PoissonSolver((H, W), metres_per_px)
         self._slopes_0 = self._slopes(reference)  # (H, W, 2)
         self._z_0 = self._integrate(self._slopes_0)
@@ -81,8 +82,7 @@ class PaperDepth:
         grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         masked = (grey >= self._threshold[0]) & (grey <= self._threshold[1])  # (H, W)
         colours = image.astype(np.float32)
-        if self._gel.convention.background == "ratio":
-            colours = np.asarray(colours / np.maximum(self._reference, 1.0) - 1.0, dtype=np.float32)
+        colours = self._gel.convention.colours(colours, self._background)
         seen = ~masked.ravel()
         slopes = np.zeros((seen.size, 2), dtype=np.float32)
         slopes[seen] = self._gel.slopes(colours.reshape(-1, 3)[seen], self._unit_uv[seen])

@@ -26,7 +26,7 @@ class Convention:
         channels: Order of the three colours.
         coordinates: ``unit``: u/W and v/H; ``zero``: both 0, whatever the pixel.
         background: ``none``: colours are grey levels over ``input_scale``; ``ratio``: grey levels over those
-            of the untouched gel, minus 1.
+            of the untouched gel, minus 1 (lamps may change and dark corners count as much as the bright middle).
         input_scale: Grey level that becomes 1 (``background: none`` only).
         output: ``normals``: (n_x, n_y) of the unit surface normal, slopes are −n_x/n_z and −n_y/n_z;
             ``slopes``: (∂z/∂x, ∂z/∂y); ``angles``: their arctangents.
@@ -40,6 +40,12 @@ class Convention:
     input_scale: float = 255.0
     output: Literal["normals", "slopes", "angles"] = "normals"
     z_axis: Literal["out", "in"] = "out"
+
+    def colours(self, image: Float32Array, background: Float32Array) -> Float32Array:
+        """What :meth:`GelModel.slopes` wants of an image (..., 3): itself, or its ratio to the background − 1."""
+        if self.background == "none":
+            return image
+        return np.asarray(image / np.maximum(background, np.float32(1)) - np.float32(1), dtype=np.float32)
 
     def metadata(self) -> dict[str, str]:
         """Key-value pairs for the ONNX file."""

@@ -105,8 +105,16 @@ def detect_markers(image: Image) -> Markers:
     return markers
 
 
-def _dot_regions(contrast: Contrast) -> list[NDArray[np.int32]]:
-    """Outlines of what looks like dots, (k, 1, 2) px each: compact, of similar size, off the border."""
+def dot_mask(image: Image, margin_px: int = 2) -> BoolArray:
+    """Pixels of dots, those cut by the border included, grown by a margin; (H, W). No minimum number."""
+    mask = np.zeros(image.shape[:2], dtype=np.uint8)
+    cv2.drawContours(mask, _dot_regions(dot_contrast(image), on_border=True), -1, 1, thickness=cv2.FILLED)
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * margin_px + 1, 2 * margin_px + 1))
+    return np.asarray(cv2.dilate(mask, kernel), dtype=np.bool_)
+
+
+def _dot_regions(contrast: Contrast, on_border: bool = False) -> list[NDArray[np.int32]]:
+    """Outlines of what looks like dots, (k, 1, 2) px each: compact and of similar size."""
     H, W = contrast.shape
     dark = (contrast > _threshold(contrast)).astype(np.uint8)
     whole = cv2.morphologyEx(dark, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 3)))
@@ -117,17 +125,18 @@ def _dot_regions(contrast: Contrast) -> list[NDArray[np.int32]]:
         u, v, w, h = cv2.boundingRect(outline)
         area = _outline_area(outline)
         diameter = 2.0 * np.sqrt(area / np.pi)
-        on_border = u <= 0 or v <= 0 or u + w >= W or v + h >= H
-        if on_border or not _MIN_DIAMETER_PX <= diameter <= _MAX_DIAMETER * W:
+        cut = u <= 0 or v <= 0 or u + w >= W or v + h >= H
+        if (cut and not on_border) or not _MIN_DIAMETER_PX <= diameter <= _MAX_DIAMETER * W:
             continue
-        if max(w, h) > 2.2 * min(w, h) or area < 0.5 * w * h * np.pi / 4:
+        if (not cut and max(w, h) > 2.2 * min(w, h)) or area < 0.4 * w * h:
             continue  # a scratch, an edge of the contact
         kept.append(np.asarray(outline, dtype=np.int32))
         areas.append(area)
     if not kept:
         return []
     typical = _typical(np.asarray(areas))
-    return [o for o, area in zip(kept, areas, strict=True) if 0.3 * typical <= area <= 3.0 * typical]
+    least = 0.1 if on_border else 0.3
+    return [o for o, area in zip(kept, areas, strict=True) if least * typical <= area <= 3.0 * typical]
 
 
 def _threshold(contrast: Contrast) -> float:

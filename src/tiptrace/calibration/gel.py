@@ -1,0 +1,153 @@
+"""Calibrate a gel from ball presses: ``tiptrace calibrate gel``."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from tiptrace.calibration.gel_circles import PressSamples, contact_samples, find_circles
+from tiptrace.calibration.gel_data import Circle, PressFolder, read_press_folder
+from tiptrace.calibration.gel_evaluation import PressScore, measured_slopes, score_press
+from tiptrace.calibration.gel_network import HIDDEN, Progress, train_network
+from tiptrace.calibration.gel_onnx import mlp_to_onnx
+from tiptrace.calibration.gel_shading import Shading, fit_shading
+from tiptrace.perception.gel_model import Convention, GelModel
+from tiptrace.types import FloatArray
+
+_ONE_PLACE = 0.25  # of the image's width and height that the contacts must span to teach the place
+_HELD_OUT = 5  # every fifth press
+
+
+@dataclass(frozen=True, slots=True)
+class GelTrainingReport:
+    """How good a calibrated gel is, on presses that it was not trained on.
+
+    Attributes:
+        model: ONNX file that was written.
+        trained_on: Images used.
+        held_out: Scores of the others.
+        normal_error_deg: Median over the held-out presses of their median normal error.
+        depth_rms_m: Rms over the held-out presses of the depth error inside the contact.
+        radius_error: Median over the held-out presses of |ball radius found / true − 1|.
+        flatness_m: Rms slope of the untouched reference times one millimetre: what 1 mm of it would rise.
+        max_slope: Steepest slope in the training presses; steeper ones are extrapolated.
+        mm_per_px: Scale used.
+        scale_is_assumed: True if nobody gave the scale.
+        marker_pitch_mm: What the scale makes of the markers' pitch; None without dots.
+        valid_px: (u_min, v_min, u_max, v_max) that the contacts cover.
+        one_place: True if the presses cover too little of the gel to teach its dependence on place.
+        circles: Contact of each press, found or refined.
+        seconds: Time taken.
+    """
+
+    model: Path
+    trained_on: tuple[str, ...]
+    held_out: tuple[PressScore, ...]
+    normal_error_deg: float
+    depth_rms_m: float
+    radius_error: float
+    flatness_m: float
+    max_slope: float
+    mm_per_px: tuple[float, float]
+    scale_is_assumed: bool
+    marker_pitch_mm: float | None
+    valid_px: tuple[float, float, float, float]
+    one_place: bool
+    circles: dict[str, Circle]
+    seconds: float
+
+
+def train_gel(
+    folder: Path,
+    out: Path,
+    *,
+    seed: int = 0,
+    mm_per_px: tuple[float, float] | None = None,
+    progress: Progress | None = None,
+) -> GelTrainingReport:
+    """Train a gel network on a folder of ball presses and write it as ONNX.
+
+    Args:
+        folder: Holds ``reference.png``, ``presses.csv`` and the images (see :func:`read_press_folder`).
+        out: ONNX file to write.
+        seed: Decides held-out presses, samples and initial weights.
+        mm_per_px: Scale (x, y) of the images; None: the csv's, else 20 mm over the image's width.
+        progress: Called with a label and the share done.
+
+    Raises:
+        CalibrationError: a folder that does not determine the gel.
+        MissingExtraError: scikit-learn or onnx is not installed.
+    """
+    start = time.perf_counter()
+    tell = progress or (lambda _label, _share: None)
+    data = read_press_folder(folder, mm_per_px)
+    tell("finding the contacts", 0.0)
+    valid_guess = [p.circle for p in data.presses]
+    circles, _ = find_circles(data, 1 if None in valid_guess else 2)
+    valid, one_place = _coverage(data, circles)
+    rng = np.random.default_rng(seed)
+    test = set(rng.permutation(len(circles))[: max(len(circles) // _HELD_OUT, 1)].tolist())
+    train = [i for i in range(len(circles)) if i not in test]
+    shading = shading_of(data, circles, train, one_place=one_place)
+    convention = Convention(background="ratio", coordinates="zero" if one_place else "unit")
+    network = train_network(shading, data.background, pixel_noise(data), convention, rng, tell)
+    metadata = _metadata(data, valid, shading)
+    out.write_bytes(mlp_to_onnx(network.weights, network.biases, convention, metadata=metadata))
+    gel = GelModel(out.read_bytes(), str(out))
+    scores = tuple(score_press(gel, data.presses[i], circles[i], data) for i in sorted(test))
+    flat = measured_slopes(gel, data.reference, data.background, data.presses[0].dots)
+    pitch = data.marker_pitch_px
+    return GelTrainingReport(
+        model=out,
+        trained_on=tuple(data.presses[i].name for i in train),
+        held_out=scores,
+        normal_error_deg=float(np.median([s.normal_error_deg for s in scores])),
+        depth_rms_m=float(np.sqrt(np.mean([s.depth_rms_m**2 for s in scores]))),
+        radius_error=float(np.median([abs(s.radius_error) for s in scores])),
+        flatness_m=float(np.sqrt(np.mean(flat**2))) * 1e-3,
+        max_slope=shading.max_slope,
+        mm_per_px=data.mm_per_px,
+        scale_is_assumed=data.scale_is_assumed,
+        marker_pitch_mm=None if pitch is None else pitch * float(np.mean(data.mm_per_px)),
+        valid_px=valid,
+        one_place=one_place,
+        circles={p.name: c for p, c in zip(data.presses, circles, strict=True)},
+        seconds=time.perf_counter() - start,
+    )
+
+
+def shading_of(data: PressFolder, circles: list[Circle], which: list[int], *, one_place: bool) -> Shading:
+    """Shading model from some of the presses."""
+    parts = [contact_samples(data.presses[i], circles[i], data) for i in which]
+    stacked = [np.concatenate([getattr(p, name) for p in parts]) for name in PressSamples.__slots__]
+    return fit_shading(*stacked, place_degree=0 if one_place else 2)
+
+
+def pixel_noise(data: PressFolder) -> FloatArray:
+    """(3,) noise of a pixel after the chain's smoothing: half of what the reference shows against its mean."""
+    residual = data.reference.astype(np.float64) - data.background
+    return np.asarray(0.5 * 1.4826 * np.median(np.abs(residual), axis=(0, 1)) + 0.2)
+
+
+def _coverage(data: PressFolder, circles: list[Circle]) -> tuple[tuple[float, float, float, float], bool]:
+    """Rectangle that the contacts cover, and whether it is too small."""
+    c = np.array([(c.u, c.v, c.radius) for c in circles])
+    H, W = data.reference.shape[:2]
+    low, high = np.min(c[:, :2] - c[:, 2:], axis=0), np.max(c[:, :2] + c[:, 2:], axis=0)
+    spread = np.ptp(c[:, :2], axis=0) / (W, H)
+    return (float(low[0]), float(low[1]), float(high[0]), float(high[1])), bool((spread < _ONE_PLACE).any())
+
+
+def _metadata(data: PressFolder, valid: tuple[float, ...], shading: Shading) -> dict[str, str]:
+    H, W = data.reference.shape[:2]
+    return {
+        "mm_per_px": ",".join(f"{s:.6g}" for s in data.mm_per_px),
+        "image_size_px": f"{W},{H}",
+        "valid_px": ",".join(f"{x:.1f}" for x in valid),
+        "max_slope": f"{shading.max_slope:.3f}",
+        "hidden": "-".join(map(str, HIDDEN)),
+        "presses": str(len(data.presses)),
+    }
