@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from bisect import bisect_left
+from collections.abc import Sequence
 from dataclasses import dataclass
 from operator import attrgetter
+
+import numpy as np
 
 from tiptrace.geometry.screw import interpolate_screw
 from tiptrace.types import FloatArray, PoseSample
@@ -61,20 +64,32 @@ class PoseTrack:
             and self._samples[place].stamp_ns <= self._samples[-1].stamp_ns - self._delay_ns
         )
 
-    def at(self, stamp_ns: int) -> FloatArray | PoseGap:
-        """T_B_E at an instant, (4, 4), or the gap that it lies in."""
+    def at(self, stamps_ns: Sequence[int]) -> FloatArray | PoseGap:
+        """T_B_E at some instants, (n, 4, 4), or the first gap that one of them lies in."""
+        brackets = []
+        for stamp_ns in stamps_ns:
+            bracket = self._around(stamp_ns)
+            if isinstance(bracket, PoseGap):
+                return bracket
+            brackets.append(bracket)
+        T_0 = np.stack([before.T_B_E for before, _, _ in brackets])
+        T_1 = np.stack([after.T_B_E for _, after, _ in brackets])
+        return interpolate_screw(T_0, T_1, np.array([fraction for _, _, fraction in brackets]))
+
+    def _around(self, stamp_ns: int) -> tuple[PoseSample, PoseSample, float] | PoseGap:
+        """The samples around an instant, and how far it lies between them."""
         samples = self._samples
         place = bisect_left(samples, stamp_ns, key=_stamp)
         after = samples[place] if place < len(samples) else None
         if after is not None and after.stamp_ns == stamp_ns:
-            return after.T_B_E
+            return after, after, 0.0
         before = samples[place - 1] if place > 0 else None
         if before is None or after is None:
             return PoseGap(before.stamp_ns if before else None, after.stamp_ns if after else None)
         span_ns = after.stamp_ns - before.stamp_ns
         if span_ns > self._max_gap_ns:
             return PoseGap(before.stamp_ns, after.stamp_ns)
-        return interpolate_screw(before.T_B_E, after.T_B_E, (stamp_ns - before.stamp_ns) / span_ns)
+        return before, after, (stamp_ns - before.stamp_ns) / span_ns
 
     def take_until(self, stamp_ns: int) -> tuple[PoseSample, ...]:
         """Samples up to an instant that have not been handed out before, in order."""

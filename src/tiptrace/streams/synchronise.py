@@ -220,18 +220,15 @@ class Synchroniser:
             return None
         if not (self._ended or self._marks_complete_to(stamp_ns)):
             return None
-        T_left, T_right = self._track.at(left.stamp_ns), self._track.at(right.stamp_ns)
-        for gap in (T_left, T_right):
-            if isinstance(gap, PoseGap):
-                self.report.add_gap(stamp_ns, gap)
-                return gap
-        assert not isinstance(T_left, PoseGap)
-        assert not isinstance(T_right, PoseGap)
+        T_B_E = self._track.at((left.stamp_ns, right.stamp_ns))  # (2, 4, 4)
+        if isinstance(T_B_E, PoseGap):
+            self.report.add_gap(stamp_ns, T_B_E)
+            return T_B_E
         phase, opening = self._phase_at(stamp_ns), self._opening_at(stamp_ns)
         return Observation(
             stamp_ns=stamp_ns,
-            left=FingerObservation(left, T_left),
-            right=FingerObservation(right, T_right),
+            left=FingerObservation(left, T_B_E[0]),
+            right=FingerObservation(right, T_B_E[1]),
             phase=phase,
             opening_m=opening,
             poses=self._track.take_until(last_ns),
