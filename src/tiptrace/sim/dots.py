@@ -10,7 +10,8 @@ from scipy.special import erf
 from tiptrace.sim.gel import Float32Array, GelDeformation
 from tiptrace.types import FloatArray
 
-_STEP_M = 0.1e-3  # distance over which a dot's stretch is measured
+_STEP_M = 0.3e-3  # distance over which a dot's stretch is measured
+_MOST_STRAIN = 0.3
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,11 +122,19 @@ def place_dots(
     n = len(rest)
     at = moved[:n]
     F = np.stack([moved[n : 2 * n, :2] - at[:, :2], moved[2 * n :, :2] - at[:, :2]], axis=-1) / _STEP_M
+    F = _bounded(F)
     px = 1 / np.asarray(metres_per_px)
     centre = (np.asarray(size_px) - 1) / 2
     outline = px[:, None] * (F @ dots.shape * dots.radius_m[:, None, None])
     surface = np.column_stack([rest, np.zeros(n)]) + deformation.displacement(rest)
     return DotTruth(at[:, :2] * px + centre, at, surface, outline, px)
+
+
+def _bounded(F: FloatArray) -> FloatArray:
+    """A dot is stiffer than bare gel: its own strain levels off at ``_MOST_STRAIN``."""
+    strain = F - np.eye(2)  # (n, 2, 2)
+    size = np.linalg.norm(strain, axis=(1, 2), keepdims=True)
+    return np.asarray(np.eye(2) + strain / np.sqrt(1 + (size / _MOST_STRAIN) ** 2))
 
 
 def dot_transmission(

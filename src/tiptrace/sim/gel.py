@@ -248,8 +248,10 @@ def _shear_at(deformation: GelDeformation, points: FloatArray) -> FloatArray:
     contact, gel = deformation.contact, deformation.parameters
     if len(contact.nodes_m) == 0:
         return np.zeros((len(points), 2))
-    overlap = deformation.grid.at(contact.penetration_m, contact.nodes_m, order=1)  # (k,)
-    weight = np.clip(overlap / 50e-6, 1e-6, 1)  # a node that just touches counts little: no jumps
+    overlap = np.maximum(deformation.grid.at(contact.penetration_m, contact.nodes_m, order=1), 0)  # (k,)
+    weight = (
+        overlap / max(float(overlap.max()), 1e-6)
+    ) ** 2 + 1e-6  # lightly loaded nodes at the rim count little
     fit = _local_linear(points, contact.nodes_m, contact.shear_m, weight, gel.follow_m)
     engaged = deformation.grid.at(deformation.engaged, points, order=1)
     return fit * np.clip(engaged, 0, 1)[:, None]
@@ -258,9 +260,15 @@ def _shear_at(deformation: GelDeformation, points: FloatArray) -> FloatArray:
 def _local_linear(
     points: FloatArray, nodes: FloatArray, values: FloatArray, weight: FloatArray, reach: float
 ) -> FloatArray:
-    """Moving least squares of first order: exact for fields linear in position, bounded outside."""
-    d2 = ((points[:, None] - nodes[None]) ** 2).sum(-1) / (2 * reach**2)  # (n, k)
-    w = weight * np.exp(d2.min(axis=1, keepdims=True) - d2)
+    """Moving least squares of first order: exact for fields linear in position, bounded outside.
+
+    The reach grows with the distance to the contact, so that the field fades smoothly from all of its near side.
+    """
+    d2 = ((points[:, None] - nodes[None]) ** 2).sum(-1)  # (n, k)
+    gap = d2.min(axis=1, keepdims=True)
+    nearest = gap - reach**2 * np.log(np.exp((gap - d2) / reach**2).sum(axis=1, keepdims=True))  # smooth
+    spread = reach**2 + 4 * np.maximum(nearest, 0)
+    w = weight * np.exp((gap - d2) / (2 * spread))
     w /= w.sum(axis=1, keepdims=True)
     products = [nodes[:, i] * other[:, j] for other in (nodes, values) for i in (0, 1) for j in (0, 1)]
     moments = np.einsum("nk,kf->nf", w, np.column_stack([nodes, values, *products]))  # (n, 12)
@@ -269,8 +277,8 @@ def _local_linear(
     B = moments[:, 8:12].reshape(-1, 2, 2) - centre[:, :, None] * mean[:, None, :]
     slope = np.linalg.solve(C + 1e-3 * reach**2 * np.eye(2), B)  # (n, 2, 2)
     offset = points - centre
-    far = np.linalg.norm(offset, axis=1, keepdims=True) / (2 * reach)
-    return np.asarray(mean + np.einsum("ni,nij->nj", offset / np.sqrt(1 + far**4), slope))
+    far = np.linalg.norm(offset, axis=1, keepdims=True) / (1.5 * reach)
+    return np.asarray(mean + np.einsum("ni,nij->nj", offset / (1 + far**8) ** 0.125, slope))
 
 
 def spline_coefficients(values: Float32Array) -> Float32Array:
