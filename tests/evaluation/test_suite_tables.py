@@ -33,7 +33,13 @@ def test_the_papers_sets_hold_twelve_distinct_conditions():
     assert [len(c) for c in CONDITION_SETS.values()] == [5, 4, 3, 3]
     assert sets_of(Condition("T3", "O1", "W1", "G1")) == ("A", "B", "D")
     assert sets_of(Condition("T3", "O2", "W1", "G1")) == ("B", "C")
-    assert 11 * 4 + 7 == 51
+
+
+def test_the_virtual_rig_has_the_same_sets():
+    from tiptrace.sim import conditions as rig
+
+    rigs = {name: {c.name for c in group} for name, group in rig.CONDITION_SETS.items()}
+    assert rigs == {name: {str(c) for c in group} for name, group in CONDITION_SETS.items()}
 
 
 def test_overall_is_mean_and_std_over_trials_with_the_published_row():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,15 +10,16 @@ from typing import TYPE_CHECKING
 from tiptrace.errors import OutputError
 from tiptrace.evaluation import figures_sensing as sensing
 from tiptrace.evaluation import figures_trajectory as space
+from tiptrace.evaluation.embedding import FIGURES, EmbeddedFigure, embed_figure, render
 from tiptrace.evaluation.quality import assess
 from tiptrace.evaluation.report_data import ReportData
 from tiptrace.evaluation.result_table import COLUMNS, result_rows
-from tiptrace.evaluation.style import figure_style, save_figure
+from tiptrace.evaluation.style import figure_style
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-REPORT, FIGURES = "report.html", "figures"
+REPORT = "report.html"
 
 
 def _has_positions(data: ReportData) -> bool:
@@ -36,16 +36,6 @@ class _Section:
     draw: Callable[[ReportData], Figure]
     wanted: Callable[[ReportData], bool]
     bitmap: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class EmbeddedFigure:
-    """A figure as the page holds it."""
-
-    name: str
-    title: str
-    caption: str
-    data_uri: str
 
 
 _SECTIONS = (
@@ -137,15 +127,8 @@ def write_trial_report(folder: Path, data: ReportData) -> Path:
 
 def render_page(data: ReportData, figures: list[EmbeddedFigure]) -> str:
     """The page's text."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
-    environment = Environment(
-        loader=PackageLoader("tiptrace.evaluation"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-    )
-    return environment.get_template("trial_report.html.j2").render(
+    return render(
+        "trial_report.html.j2",
         data=data,
         figures=figures,
         columns=COLUMNS,
@@ -156,10 +139,6 @@ def render_page(data: ReportData, figures: list[EmbeddedFigure]) -> str:
 
 
 def _figures(folder: Path, data: ReportData) -> Iterator[EmbeddedFigure]:
-    for section in _SECTIONS:
-        if not section.wanted(data):
-            continue
-        save_figure(section.draw(data), folder / section.name)
-        kind, mime = ("png", "image/png") if section.bitmap else ("svg", "image/svg+xml")
-        encoded = base64.b64encode((folder / f"{section.name}.{kind}").read_bytes()).decode()
-        yield EmbeddedFigure(section.name, section.title, section.caption, f"data:{mime};base64,{encoded}")
+    for s in _SECTIONS:
+        if s.wanted(data):
+            yield embed_figure(folder, s.name, s.title, s.caption, s.draw(data), s.bitmap)

@@ -1,0 +1,44 @@
+"""Figures inside a page that stands alone, and the pages' templates."""
+
+from __future__ import annotations
+
+import base64
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tiptrace.evaluation.style import save_figure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+FIGURES = "figures"
+
+
+@dataclass(frozen=True, slots=True)
+class EmbeddedFigure:
+    """A figure as a page holds it."""
+
+    name: str
+    title: str
+    caption: str
+    data_uri: str
+
+
+def embed_figure(
+    folder: Path, name: str, title: str, caption: str, figure: Figure, bitmap: bool = False
+) -> EmbeddedFigure:
+    """Save a figure in all formats and embed it, as SVG unless a bitmap is asked for."""
+    save_figure(figure, folder / name)
+    kind, mime = ("png", "image/png") if bitmap else ("svg", "image/svg+xml")
+    encoded = base64.b64encode((folder / f"{name}.{kind}").read_bytes()).decode()
+    return EmbeddedFigure(name, title, caption, f"data:{mime};base64,{encoded}")
+
+
+def render(template: str, **values: object) -> str:
+    """Fill a template of this package; everything is escaped."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    loader = PackageLoader("tiptrace.evaluation")
+    environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True)
+    return environment.get_template(template).render(**values)

@@ -1,0 +1,201 @@
+"""Figures over the trials of a suite, as in the paper and beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tiptrace.evaluation import published, style
+from tiptrace.evaluation.conditions import CONDITION_SETS, VARIED, Condition
+from tiptrace.evaluation.records import TrialRecord
+from tiptrace.evaluation.statistics import spearman, summarise
+from tiptrace.evaluation.suite_tables import BASELINES, aligned, methods_of, set_values, values_by_trial
+from tiptrace.evaluation.traces import TrialTraces
+from tiptrace.types import FloatArray
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_MARKS = ("o", "s", "^", "D", "v", "P")
+
+
+def error_against_anchoring(records: Sequence[TrialRecord]) -> Figure:
+    """Trajectory and shape RMSE against the initial contact error (the paper's error decomposition)."""
+    figure = style.new_figure(7.2, 3.4)
+    panels = figure.subplots(1, 2)
+    names = ("trajectory_rmse_mm", "shape_rmse_mm")
+    titles = ("Trajectory RMSE [mm]", "Shape RMSE [mm]")
+    for ax, name, title in zip(panels, names, titles, strict=True):
+        for k, method in enumerate(methods_of(records)):
+            contact = values_by_trial(records, method, "initial_contact_error_mm")
+            error = values_by_trial(records, method, name)
+            x, y = np.array(list(contact.values())), np.array([error[t] for t in contact])
+            rho = spearman(x, y, samples=200).rho
+            label = method if np.isnan(rho) else f"{method}: ρ = {rho:.2f}"
+            colour, _ = style.method_style(method, k)
+            ax.scatter(
+                x, y, s=16, marker=_MARKS[k % len(_MARKS)], color=colour, alpha=0.75, lw=0, label=label
+            )
+        ax.set(xlabel="initial contact error [mm]", ylabel=title, xlim=(0, None), ylim=(0, None))
+        ax.set_title(f"ρ in the paper: {published.SPEARMAN[name]:.2f}")
+        ax.legend(loc="best")
+    return figure
+
+
+def shape_by_set(records: Sequence[TrialRecord]) -> Figure:
+    """Distribution of the shape RMSE in each condition set, beside the paper's range of set means."""
+    methods = methods_of(records)
+    figure = style.new_figure(7.2, 3.4)
+    ax = figure.subplots()
+    width = 0.8 / max(1, len(methods))
+    for k, method in enumerate(methods):
+        colour, _ = style.method_style(method, k)
+        for place, name in enumerate(CONDITION_SETS):
+            values = set_values(records, method, name, "shape_rmse_mm")
+            values = values[np.isfinite(values)]
+            if len(values) == 0:
+                continue
+            x = place + (k - (len(methods) - 1) / 2) * width
+            box = ax.boxplot(
+                values,
+                positions=[x],
+                widths=0.7 * width,
+                showfliers=False,
+                patch_artist=True,
+                medianprops={"color": style.BLACK},
+                boxprops={"facecolor": colour, "alpha": 0.45},
+            )
+            if place == 0:
+                box["boxes"][0].set_label(method)
+            jitter = (np.arange(len(values)) * 0.618 % 1 - 0.5) * 0.45 * width
+            ax.plot(x + jitter, values, ".", ms=3.5, color=colour)
+    low, high = published.SET_SHAPE_RANGE_MM
+    ax.axhspan(low, high, color="#DDDDDD", zorder=0, lw=0, label=f"set means in the paper: {low} – {high} mm")
+    labels = [f"{name}: {VARIED[name]}\n({len(CONDITION_SETS[name])} conditions)" for name in CONDITION_SETS]
+    ax.set_xticks(range(len(labels)), labels)
+    ax.set(
+        ylabel="shape RMSE [mm]",
+        ylim=(0, None),
+        title="Shape error by condition set",
+    )
+    ax.grid(visible=False, axis="x")
+    figure.legend(loc="outside lower center", ncols=4)
+    return figure
+
+
+def overlays(traces: Iterable[tuple[Condition, TrialTraces]], method: str) -> Figure:
+    """Reconstructed traces over the true ones, a panel per condition, a row per set; lateral axis stretched."""
+    by_condition: dict[Condition, list[TrialTraces]] = {}
+    for condition, trace in traces:
+        by_condition.setdefault(condition, []).append(trace)
+    columns = max(len(c) for c in CONDITION_SETS.values())
+    figure = style.new_figure(9.6, 6.4)
+    axes = figure.subplots(len(CONDITION_SETS), columns, sharex=True, sharey="row", squeeze=False)
+    colour, _ = style.method_style(method)
+    for row, (name, conditions) in zip(axes, CONDITION_SETS.items(), strict=True):
+        for ax, condition in zip(row, conditions, strict=False):
+            found = by_condition.get(condition, [])
+            _overlay(ax, found, method, colour)
+            ax.set_title(f"{name}: {condition} ({len(found)})", fontsize=8)
+        for ax in row[len(conditions) :]:
+            ax.set_axis_off()
+        row[0].set_ylabel("y [mm]")
+    for column in axes.T:
+        lowest = [ax for ax in column if ax.axison][-1]
+        lowest.set_xlabel("x [mm]")
+        lowest.tick_params(labelbottom=True)
+    figure.suptitle(
+        f"{method} (colour) over the true tip (black), top view from the start, y stretched", fontsize=9
+    )
+    return figure
+
+
+def against_baselines(
+    records: Sequence[TrialRecord], method: str, metric: str = "trajectory_rmse_mm"
+) -> Figure | None:
+    """Each trial's error by a method against that by each baseline; None where there is no baseline."""
+    present = methods_of(records)
+    rivals = [m for m in present if m != method and (m in BASELINES or m == "paper")]
+    if not rivals:
+        return None
+    figure = style.new_figure(min(9.0, 0.6 + 2.6 * len(rivals)), 3.1)
+    for ax, rival in zip(figure.subplots(1, len(rivals), squeeze=False)[0], rivals, strict=True):
+        ours, theirs = aligned(records, (method, rival), metric)
+        both = np.isfinite(ours) & np.isfinite(theirs)
+        ours, theirs = ours[both], theirs[both]
+        top = 1.05 * float(max(ours.max(initial=0.1), theirs.max(initial=0.1)))
+        ax.plot([0, top], [0, top], color=style.GREY, lw=1)
+        ax.scatter(theirs, ours, s=14, color=style.method_style(method)[0], alpha=0.7, lw=0)
+        ax.set(xlim=(0, top), ylim=(0, top), xlabel=f"{rival} [mm]", ylabel=f"{method} [mm]", aspect="equal")
+        ax.set_title(f"better in {int(np.sum(ours < theirs))} of {len(ours)}")
+    return figure
+
+
+def error_distribution(records: Sequence[TrialRecord], metric: str = "trajectory_rmse_mm") -> Figure:
+    """Part of the trials within an error, for each method."""
+    from matplotlib.ticker import LogLocator, NullFormatter
+
+    figure = style.new_figure(7.2, 2.8)
+    ax = figure.subplots()
+    for k, method in enumerate(methods_of(records)):
+        values = np.array(list(values_by_trial(records, method, metric).values()))
+        trials = len(values)
+        values = np.sort(values[np.isfinite(values)])
+        colour, dash = style.method_style(method, k)
+        share = np.arange(1, len(values) + 1) / max(1, trials)  # failures never come within any error
+        ax.step(
+            values,
+            share,
+            where="post",
+            color=colour,
+            linestyle=dash,
+            label=f"{method} ({len(values)} of {trials})",
+        )
+    ax.set(xlabel="trajectory RMSE [mm]", ylabel="part of the trials", ylim=(0, 1.02))
+    ax.set_xscale("log")
+    ax.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    ax.xaxis.set_major_formatter("{x:g}")
+    ax.xaxis.set_minor_formatter(NullFormatter())
+    ax.set_title("Trials within an error; those that gave no result never come within it")
+    ax.legend(loc="lower right")
+    return figure
+
+
+def error_budget(budget: Mapping[str, Sequence[TrialRecord]], metric: str = "trajectory_rmse_mm") -> Figure:
+    """Error with one disturbance at a time, by method: mean over trials, whisker to the 95th percentile."""
+    methods = methods_of([r for records in budget.values() for r in records])
+    figure = style.new_figure(7.2, 1.2 + 0.22 * len(budget) * max(1, len(methods)))
+    ax = figure.subplots()
+    height = 0.8 / max(1, len(methods))
+    for k, method in enumerate(methods):
+        colour, _ = style.method_style(method, k)
+        s = [
+            summarise(list(values_by_trial(records, method, metric).values())) for records in budget.values()
+        ]
+        y = np.arange(len(budget)) + (k - (len(methods) - 1) / 2) * height
+        ax.barh(y, [x.mean for x in s], height=0.85 * height, color=colour, label=method)
+        ax.hlines(y, [x.mean for x in s], [x.p95 for x in s], color=style.BLACK, lw=0.8)
+    ax.set_yticks(range(len(budget)), list(budget))
+    ax.invert_yaxis()
+    ax.grid(visible=False, axis="y")
+    ax.set(xlabel=f"{metric.replace('_rmse_mm', ' RMSE').replace('_', ' ')} [mm]")
+    ax.set_title("One disturbance at a time: mean over trials, whisker to the 95th percentile")
+    figure.legend(loc="outside lower center", ncols=len(methods))
+    return figure
+
+
+def _overlay(ax: Axes, traces: Sequence[TrialTraces], method: str, colour: str) -> None:
+    for trace in traces:
+        p = trace.methods_mm.get(method)
+        if p is not None:
+            ax.plot(p[:, 0], p[:, 1], color=colour, lw=0.7, alpha=0.7)
+    truth = _finite_truth(traces)
+    if truth is not None:
+        ax.plot(truth[:, 0], truth[:, 1], color=style.TRUTH, lw=1.4)
+
+
+def _finite_truth(traces: Sequence[TrialTraces]) -> FloatArray | None:
+    return next((t.truth_mm for t in traces if len(t.truth_mm)), None)
