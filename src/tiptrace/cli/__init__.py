@@ -11,8 +11,10 @@ from rich.markup import escape
 import tiptrace
 from tiptrace.cli.calibrate_tip import calibrate_tip
 from tiptrace.cli.demo import demo
+from tiptrace.cli.inspect import inspect
 from tiptrace.cli.reconstruct import reconstruct
 from tiptrace.cli.simulate import simulate
+from tiptrace.cli.surface import surface
 from tiptrace.errors import TipTraceError
 
 app = typer.Typer(
@@ -27,6 +29,7 @@ app.add_typer(calibrate, name="calibrate")
 app.command()(demo)
 app.command()(simulate)
 app.command()(reconstruct)
+app.command()(inspect)
 calibrate.command("tip")(calibrate_tip)
 
 

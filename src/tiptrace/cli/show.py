@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
@@ -20,16 +21,18 @@ def progress_bar() -> Progress:
 
 def print_results(result: Reconstruction, title: str) -> None:
     """Result table of one trial, then the verdict and what the user should know."""
-    from tiptrace.evaluation.result_table import COLUMNS, result_rows
+    from tiptrace.evaluation.result_table import COLUMNS, MISSING, result_rows
 
     console = Console()
     rows = result_rows(result.methods, result.truth)
-    shown = [k for k in range(len(COLUMNS)) if k == 0 or any(row.cells[k] != "–" for row in rows[:-1])]
     table = Table(title=title)
-    for k in shown:
-        table.add_column(COLUMNS[k], justify="left" if k == 0 else "right", overflow="fold")
+    table.add_column("")
     for row in rows:
-        table.add_row(*(row.cells[k] for k in shown), style="dim" if row.published else "")
+        table.add_column(row.cells[0], justify="right", style="dim" if row.published else "")
+    for k in range(1, len(COLUMNS)):
+        values = [row.cells[k] for row in rows]
+        if any(value != MISSING for value in values[:-1]):
+            table.add_row(escape(COLUMNS[k]), *values)
     console.print(table)
     colour = {"pass": "green", "warn": "yellow", "fail": "red"}[result.quality.verdict]
     console.print(f"quality without ground truth: [{colour}]{result.quality.verdict}[/]")
