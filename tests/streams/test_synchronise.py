@@ -88,10 +88,22 @@ def test_no_unused_image_is_nearer_than_the_partner(left: list[int], right: list
     for a, b in pairs:
         assert all(abs(x - b) >= abs(a - b) for x in free_left)
         assert all(abs(x - a) >= abs(a - b) for x in free_right)
-    for x, y in itertools.product(
-        free_left, free_right
-    ):  # two left over are far apart, or a pair lies across
-        assert abs(x - y) > 20 * MS or any((x - a) * (y - b) < 0 for a, b in pairs)
+
+
+frames_ms = st.lists(st.integers(40, 90), min_size=1, max_size=12).map(
+    lambda gaps: list(itertools.accumulate(gaps))
+)
+
+
+@given(left=frames_ms, right=frames_ms)
+def test_at_camera_rates_nobody_with_a_partner_is_left_alone(left: list[int], right: list[int]) -> None:
+    """Frames at most at 25 Hz, some dropped: whoever is left over has nobody free within the limit."""
+    samples = in_order([image("left", ms) for ms in left] + [image("right", ms) for ms in right])
+    samples += poses(700, 1200)
+    found, _ = run(samples)
+    free_left = {T0 + ms * MS for ms in left} - {o.left.sample.stamp_ns for o in found}
+    free_right = {T0 + ms * MS for ms in right} - {o.right.sample.stamp_ns for o in found}
+    assert all(abs(x - y) > 20 * MS for x, y in itertools.product(free_left, free_right))
 
 
 @settings(max_examples=60, deadline=None)
