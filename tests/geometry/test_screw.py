@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 import numpy as np
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.linalg import expm
@@ -17,6 +17,7 @@ def pose(w: np.ndarray, t: np.ndarray) -> np.ndarray:
     return transform(rotation_exp(w), t)
 
 
+@settings(deadline=None)
 @given(w=vectors, t=vectors, dw=vectors, dt=vectors)
 def test_ends_are_met(w: np.ndarray, t: np.ndarray, dw: np.ndarray, dt: np.ndarray) -> None:
     T_0, T_1 = pose(w, t), pose(w, t) @ pose(dw, dt)
@@ -24,6 +25,7 @@ def test_ends_are_met(w: np.ndarray, t: np.ndarray, dw: np.ndarray, dt: np.ndarr
     np.testing.assert_allclose(interpolate_screw(T_0, T_1, 1.0), T_1, atol=1e-12)
 
 
+@settings(deadline=None)
 @given(w=vectors, v=vectors, s=fractions)
 def test_equals_the_matrix_exponential(w: np.ndarray, v: np.ndarray, s: float) -> None:
     twist = np.zeros((4, 4))
@@ -31,6 +33,7 @@ def test_equals_the_matrix_exponential(w: np.ndarray, v: np.ndarray, s: float) -
     np.testing.assert_allclose(interpolate_screw(np.eye(4), expm(twist), s), expm(s * twist), atol=1e-9)
 
 
+@settings(deadline=None)
 @given(w=vectors, p=vectors, s=fractions)
 def test_a_fixed_point_stays(w: np.ndarray, p: np.ndarray, s: float) -> None:
     R = rotation_exp(w)
@@ -38,6 +41,7 @@ def test_a_fixed_point_stays(w: np.ndarray, p: np.ndarray, s: float) -> None:
     np.testing.assert_allclose(apply(interpolate_screw(np.eye(4), T, s), p), p, atol=1e-12)
 
 
+@settings(deadline=None)
 @given(w=vectors, t=vectors, v=vectors, dt=vectors, s=fractions)
 def test_moves_with_the_frame(w: np.ndarray, t: np.ndarray, v: np.ndarray, dt: np.ndarray, s: float) -> None:
     T, T_1 = pose(w, t), pose(v, dt)
@@ -46,6 +50,7 @@ def test_moves_with_the_frame(w: np.ndarray, t: np.ndarray, v: np.ndarray, dt: n
     )
 
 
+@settings(deadline=None)
 @given(v=vectors, dt=vectors)
 def test_speed_is_constant(v: np.ndarray, dt: np.ndarray) -> None:
     T = interpolate_screw(np.eye(4), pose(v, dt), np.linspace(0, 1, 6))  # (6, 4, 4)
@@ -53,6 +58,7 @@ def test_speed_is_constant(v: np.ndarray, dt: np.ndarray) -> None:
     np.testing.assert_allclose(steps, np.broadcast_to(steps[0], steps.shape), atol=1e-12)
 
 
+@settings(deadline=None)
 @given(w=vectors)
 def test_left_jacobian_integrates_the_rotation(w: np.ndarray) -> None:
     """R(w) − I = [w] V(w), and V is even-handed near zero."""

@@ -65,6 +65,7 @@ def key(o: Observation) -> tuple[object, ...]:
 stamps_ms = st.lists(st.integers(0, 600), max_size=25, unique=True)
 
 
+@settings(deadline=None)
 @given(left=stamps_ms, right=stamps_ms)
 def test_pairs_are_near_and_use_each_image_once(left: list[int], right: list[int]) -> None:
     samples = in_order([image("left", ms) for ms in left] + [image("right", ms) for ms in right])
@@ -78,6 +79,7 @@ def test_pairs_are_near_and_use_each_image_once(left: list[int], right: list[int
     assert all(abs(a - b) <= 20 * MS for a, b in zip(used["left"], used["right"], strict=True))
 
 
+@settings(deadline=None)
 @given(left=stamps_ms, right=stamps_ms)
 def test_no_unused_image_is_nearer_than_the_partner(left: list[int], right: list[int]) -> None:
     samples = in_order([image("left", ms) for ms in left] + [image("right", ms) for ms in right])
@@ -95,6 +97,7 @@ frames_ms = st.lists(st.integers(40, 90), min_size=1, max_size=12).map(
 )
 
 
+@settings(deadline=None)
 @given(left=frames_ms, right=frames_ms)
 def test_at_camera_rates_nobody_with_a_partner_is_left_alone(left: list[int], right: list[int]) -> None:
     """Frames at most at 25 Hz, some dropped: whoever is left over has nobody free within the limit."""
