@@ -30,6 +30,7 @@ app.command()(demo)
 app.command()(simulate)
 app.command()(reconstruct)
 app.command()(inspect)
+app.command()(surface)
 calibrate.command("tip")(calibrate_tip)
 
 

@@ -1,0 +1,102 @@
+"""Commands as a user runs them: exit codes, one clear sentence, the files that they leave."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tiptrace.cli import main
+from tiptrace.sim.spec import make_spec
+from tiptrace.streams.simulated import SimulatedStream
+from tiptrace.streams.writer import write_recording
+
+COMMANDS = ("demo", "simulate", "reconstruct", "inspect", "track", "depth", "surface", "calibrate")
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):  # type: ignore[no-untyped-def]
+    def call(*arguments: object) -> tuple[int, str]:
+        monkeypatch.setattr(sys, "argv", ["tiptrace", *map(str, arguments)])
+        code = 0
+        try:
+            main()
+        except SystemExit as stop:
+            code = int(stop.code or 0)
+        captured = capsys.readouterr()
+        return code, captured.out + captured.err
+
+    return call
+
+
+@pytest.fixture(scope="module")
+def trial(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A short trial with 3-D markers in place of images."""
+    path = tmp_path_factory.mktemp("cli") / "trial.mcap"
+    stream = SimulatedStream(make_spec(mode="markers", travel_m=0.02, seed=3))
+    write_recording(path, stream, trial=stream.trial_metadata)
+    return path
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_help_with_an_example(run, command: str) -> None:  # type: ignore[no-untyped-def]
+    code, text = run(command, "--help")
+    assert code == 0
+    assert "tiptrace " in text or command == "calibrate"
+
+
+def test_reconstruct_writes_its_files_and_prints_a_table(run, trial: Path, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    code, text = run("reconstruct", trial, "--out", tmp_path, "--method", "paper", "--beside", "ee-only")
+    assert code == 0
+    for word in ("trajectory RMSE [mm]", "ee-only", "8.59", "quality"):
+        assert word in text
+    names = {"trajectory.tum", "trajectory.csv", "events.json", "metrics.json", "report.html"}
+    assert names <= {file.name for file in tmp_path.iterdir()}
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert metrics["method"] == "paper"
+    assert metrics["trajectory_rmse_mm"] < 5.0
+
+
+def test_truth_and_trial_metadata_do_not_reach_the_method(run, trial: Path, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    from tiptrace.streams.recording import Recording
+    from tiptrace.types import TruthSample
+
+    blind = tmp_path / "blind.mcap"
+    write_recording(blind, Recording(trial), trial=None)
+    assert not any(isinstance(sample, TruthSample) for sample in Recording(blind))
+    for source, out in ((trial, tmp_path / "a"), (blind, tmp_path / "b")):
+        assert run("reconstruct", source, "--out", out, "--no-report")[0] == 0
+    a, b = (np.loadtxt(tmp_path / name / "trajectory.tum") for name in ("a", "b"))
+    np.testing.assert_allclose(a, b, atol=1e-9)  # poses are written once more, hence not to the last bit
+
+
+BAD = {
+    "no file": (("reconstruct", "none.mcap"), "none.mcap"),
+    "no such method": (("reconstruct", "{trial}", "--method", "best"), "unknown method 'best'; valid: "),
+    "no such trajectory": (("simulate", "--trajectory", "T9", "--out", "{tmp}/t.mcap"), "T1"),
+    "poses missing": (("calibrate", "tip", "none.csv"), "none.csv: cannot be read"),
+    "not a recording": (("inspect", "{tmp}/text.mcap"), "text.mcap"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input_is_one_sentence_and_exit_code_2(run, trial: Path, tmp_path: Path, case: str) -> None:  # type: ignore[no-untyped-def]
+    arguments, message = BAD[case]
+    (tmp_path / "text.mcap").write_text("not a recording")
+    code, text = run(*(a.format(trial=trial, tmp=tmp_path) for a in arguments))
+    assert code == 2
+    assert "error:" in text
+    assert message in " ".join(text.split())
+    assert "Traceback" not in text
+
+
+def test_no_anchoring_frames_is_said(run, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    path = tmp_path / "trial.mcap"
+    stream = SimulatedStream(make_spec(mode="markers", travel_m=0.005, anchoring_s=0.0))
+    write_recording(path, stream)
+    code, text = run("reconstruct", path, "--out", tmp_path / "out")
+    assert code == 2
+    assert "without any anchoring frame" in text
