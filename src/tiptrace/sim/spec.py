@@ -26,7 +26,8 @@ class Dwell(_Model):
     Attributes:
         at_m: Hand travel at which it stops.
         duration_s: For how long.
-        anchoring: Whether the hand makes its anchoring motion there.
+        anchoring: Whether the hand turns about the nominal tip there (two-axis: nothing but friction holds the
+            tip in mid-groove).
     """
 
     at_m: Positive

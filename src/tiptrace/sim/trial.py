@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from tiptrace.errors import SimulationError
-from tiptrace.geometry.transforms import interpolate, transform
+from tiptrace.geometry.transforms import interpolate, rotation_exp, transform
 from tiptrace.sim.conditions import named_hold, named_wrist
 from tiptrace.sim.contact import FACE_M, GelLaw, PadForces, Pads, PadState, TipForce, TipLaw, TipState
 from tiptrace.sim.grasp import Equilibrium, Grasp, GraspState, World
@@ -28,6 +28,7 @@ _PRESS_LIMIT_M = 6e-3
 _GUARD_BAND = (0.8, 1.4)  # of the anchoring force
 _GUARD_GAIN = 0.7 / 3000.0  # m/N per step: a little under the grasp's own compliance along the tool
 _LEAST_GRIP_N = 0.5
+_FAST_MPS = 0.06  # a tip that moves faster has jumped: its speed predicts nothing
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +98,8 @@ class TrialPhysics:
     _travel_rise_m: float = field(init=False, default=0.0)
     _stiffness: float = field(init=False, default=4e3)
     _anchored: bool = field(init=False, default=False)
-    _velocity: tuple[FloatArray, FloatArray] | None = field(init=False, default=None)
+    _tip_B: FloatArray | None = field(init=False, default=None)
+    _velocity_B: FloatArray = field(init=False, default_factory=lambda: np.zeros(3))
     _slip: SlipMeter = field(init=False)
 
     def __post_init__(self) -> None:
@@ -127,6 +129,8 @@ class TrialPhysics:
         self._state = GraspState(placement.R, placement.p, PadState.fresh(len(self.grasp.pads)), TipState())
         self._slip = SlipMeter(self.grasp.pads)
         T_B_E = self._press_down(self._settle(wrist.R_B_E))
+        if spec.anchoring_s == 0.0:
+            T_B_E = self._rise(T_B_E)
         nominal = self._state.p + self.nominal_offset_E
         self.hand = Hand(spec, plan(spec), T_B_E, nominal, PADS_E)
 
@@ -189,6 +193,17 @@ class TrialPhysics:
         self._to_equilibrium(World(T, mu), 0.05, "probing")
         self._stiffness = max((pressed - float(self._last.tip.force[2])) / _PRESS_STEP_M, 500.0)
         self._to_equilibrium(World(T_B_E, mu), 0.05, "probing")
+
+    def _rise(self, T_B_E: FloatArray) -> FloatArray:
+        """Without Stage I the trial starts at the height of the travel."""
+        self._plan_rise(0.0)
+        rise, T, mu = self._travel_rise_m, T_B_E.copy(), self.grasp.pads.law.friction
+        self._travel_rise_m = 0.0
+        steps = int(np.ceil(abs(rise) / _PRESS_STEP_M)) + 1
+        for _ in range(steps):
+            T[2, 3] += rise / steps
+            self._to_equilibrium(World(T.copy(), mu), 0.05, "rising")
+        return T
 
     # --- the trial ------------------------------------------------------------------------------------------
 
@@ -270,7 +285,6 @@ class TrialPhysics:
         """One step of the hand, cut into halves where the solver needs it. True if it did."""
         if self._try(World(T_to, mu, push), dt):
             return False
-        self._velocity = None
         pieces = [(0.0, 1.0, 0)]
         while pieces:
             a, b, depth = pieces.pop()
@@ -285,33 +299,46 @@ class TrialPhysics:
         return True
 
     def _try(self, world: World, dt: float) -> bool:
-        state = self._state
-        R, p = state.R, state.p
-        if self._velocity is not None:
-            p = p + self._velocity[0] * dt
-        equilibrium = self.grasp.solve(state, world, R, p, dt)
+        R, p = self._predict(world, dt)
+        equilibrium = self.grasp.solve(self._state, world, R, p, dt)
         if not equilibrium.converged:
             return False
-        self._accept(equilibrium, dt)
+        self._accept(equilibrium, world, dt)
         return True
+
+    def _predict(self, world: World, dt: float) -> tuple[FloatArray, FloatArray]:
+        """First guess: the tip goes on as it went in the base, the tool turns about the pads to follow it."""
+        R, p = self._state.R, self._state.p
+        if self._tip_B is None:
+            return R, p
+        T = world.T_B_E
+        p_new = T[:3, :3].T @ (self._tip_B + self._velocity_B * dt - T[:3, 3])
+        lever = p - PADS_E
+        w = np.cross(lever, p_new - p) / float(lever @ lever)
+        R_new = rotation_exp(w)
+        along = lever / np.linalg.norm(lever)
+        return R_new @ R, PADS_E + R_new @ lever + along * float(along @ (p_new - p))
 
     def _relaxes(self, world: World, dt: float) -> bool:
         equilibrium = self.grasp.relax(self._state, world, self._state.R, self._state.p, dt)
         if not equilibrium.converged:
             return False
-        self._accept(equilibrium, dt)
+        self._accept(equilibrium, world, dt)
         return True
 
-    def _accept(self, equilibrium: Equilibrium, dt: float) -> None:
+    def _accept(self, equilibrium: Equilibrium, world: World, dt: float) -> None:
         before = self._state
         self._state = self.grasp.advance(before, equilibrium, dt)
         self._slip.add(before, self._state, equilibrium.pads, dt)
         self._last = equilibrium
-        speed = (self._state.p - before.p) / dt
-        self._velocity = (speed, np.zeros(3)) if np.linalg.norm(speed) < 0.05 else None
+        tip_B = world.T_B_E[:3, :3] @ equilibrium.p + world.T_B_E[:3, 3]
+        if self._tip_B is not None:
+            velocity = (tip_B - self._tip_B) / dt
+            self._velocity_B = velocity if np.linalg.norm(velocity) < _FAST_MPS else np.zeros(3)
+        self._tip_B = tip_B
 
     def _to_equilibrium(self, world: World, dt: float, where: str) -> None:
-        self._velocity = None
+        self._tip_B, self._velocity_B = None, np.zeros(3)
         if not (self._try(world, dt) or self._relaxes(world, dt)):
             self._fail(where)
 
