@@ -24,7 +24,7 @@ class MotionConfig(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     in_plane_sigma_m: float = Field(default=4e-5, gt=0)
-    depth_sigma_m: float = Field(default=1e-4, gt=0)
+    depth_sigma_m: float = Field(default=1.5e-4, gt=0)
     depth_bias_sigma_m: float = Field(default=5e-5, ge=0)
     tilt_sigma_rad: float = Field(default=0.02, gt=0)
     huber: float = Field(default=2.5, gt=0)

@@ -44,7 +44,7 @@ class TipMapConfig(BaseModel):
     drift_normal_sigma_m: float = Field(default=3e-4, gt=0)  # across them, where the tool cannot slip
     drift_evidence: float = Field(default=3.0, gt=0)  # sigmas
     pose_sigma_m: float = Field(default=4e-5, gt=0)  # of the tip through the smoothed hand pose
-    model_sigma_m: float = Field(default=5e-5, gt=0)  # what a linear map leaves
+    model_sigma_m: float = Field(default=1e-4, gt=0)  # what a linear map leaves
     outlier: float = Field(default=6.0, gt=0)  # whitened residual of a frame in which the tip did not rest
     iterations: int = Field(default=15, ge=3)
 
