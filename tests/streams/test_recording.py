@@ -223,6 +223,26 @@ def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path, stream: ListSt
         write_recording(tmp_path / "file" / "trial.mcap", stream)
 
 
+def test_a_stamp_that_the_format_cannot_hold_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match="is negative"):
+        write_recording(tmp_path / "trial.mcap", ListStream([PoseSample(-1, np.eye(4))]))
+
+
+def test_a_full_disk_is_said_in_a_sentence(stream: ListStream) -> None:
+    writer = RecordingWriter(Path("trial.mcap"), rig=make_rig())
+    writer.path, writer.partial_path = Path("/dev/full"), Path("/dev/full")
+    if not writer.partial_path.exists():
+        pytest.skip("needs /dev/full")
+
+    def fill() -> None:
+        with writer:
+            for sample in stream:
+                writer.write(sample)
+
+    with pytest.raises(RecordingError, match="No space left"):
+        fill()
+
+
 @pytest.fixture(scope="module")
 def long_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("long") / "trial.mcap"

@@ -92,7 +92,7 @@ class RecordingWriter:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._file = self.partial_path.open("wb")
         except OSError as error:
-            raise RecordingError(f"{self.partial_path}: cannot be written ({error.strerror})") from None
+            raise self._refused(error) from None
         self._writer = Writer(self._file, chunk_size=_CHUNK_BYTES)
         for name, (media_type, data) in self._attachments.items():
             self._writer.add_attachment(0, 0, name, media_type, data)
@@ -104,23 +104,38 @@ class RecordingWriter:
         """Close the file; give it its name if all went well."""
         assert self._file is not None
         try:
-            self._writer.finish()
-        finally:
-            self._file.close()
-        if kind is None:
-            os.replace(self.partial_path, self.path)
+            try:
+                self._writer.finish()
+            finally:
+                self._file.close()
+            if kind is None:
+                os.replace(self.partial_path, self.path)
+        except OSError as error:
+            raise self._refused(error) from None
 
     def write(self, sample: Sample, *, log_time_ns: int | None = None) -> None:
-        """Add one sample, logged at its own stamp unless told otherwise."""
+        """Add one sample, logged at its own stamp unless told otherwise.
+
+        Raises:
+            RecordingError: a stamp before 1970, which the format cannot hold; a disk that is full.
+        """
         log_time_ns = sample.stamp_ns if log_time_ns is None else log_time_ns
+        if min(sample.stamp_ns, log_time_ns) < 0:
+            raise RecordingError(f"{self.path}: stamp {sample.stamp_ns} ns is negative; count from 1970")
         topic, message_type, message = self._message(sample)
         if message_type not in self._schemas:
             text = messages.schema_text(message_type)
             self._schemas[message_type] = self._writer.register_msgdef(message_type, text)
         sequence = self._sequence[topic] = self._sequence.get(topic, -1) + 1
-        self._writer.write_message(
-            topic, self._schemas[message_type], message, log_time_ns, sample.stamp_ns, sequence
-        )
+        try:
+            self._writer.write_message(
+                topic, self._schemas[message_type], message, log_time_ns, sample.stamp_ns, sequence
+            )
+        except OSError as error:
+            raise self._refused(error) from None
+
+    def _refused(self, error: OSError) -> RecordingError:
+        return RecordingError(f"{self.partial_path}: cannot be written ({error.strerror})")
 
     def _message(self, sample: Sample) -> tuple[str, str, dict[str, Any]]:
         """Topic, type and content of a sample."""
