@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 FIGURES = "figures"
+_PX_PER_INCH = 138  # a full-width figure fills the page
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,6 +24,7 @@ class EmbeddedFigure:
     title: str
     caption: str
     data_uri: str
+    width_px: int
 
 
 def embed_figure(
@@ -32,7 +34,8 @@ def embed_figure(
     save_figure(figure, folder / name)
     kind, mime = ("png", "image/png") if bitmap else ("svg", "image/svg+xml")
     encoded = base64.b64encode((folder / f"{name}.{kind}").read_bytes()).decode()
-    return EmbeddedFigure(name, title, caption, f"data:{mime};base64,{encoded}")
+    width_px = round(_PX_PER_INCH * figure.get_figwidth())
+    return EmbeddedFigure(name, title, caption, f"data:{mime};base64,{encoded}", width_px)
 
 
 def render(template: str, **values: object) -> str:

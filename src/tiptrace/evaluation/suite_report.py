@@ -15,7 +15,7 @@ from tiptrace.evaluation.conditions import Condition
 from tiptrace.evaluation.embedding import FIGURES, EmbeddedFigure, embed_figure, render
 from tiptrace.evaluation.records import TrialRecord
 from tiptrace.evaluation.style import figure_style
-from tiptrace.evaluation.suite_tables import methods_of, outliers, suite_tables
+from tiptrace.evaluation.suite_tables import BASELINES, methods_of, outliers, suite_tables
 from tiptrace.evaluation.tables import write_tables
 from tiptrace.evaluation.traces import TrialTraces
 
@@ -107,7 +107,7 @@ def _figures(data: SuiteData) -> Iterator[tuple[str, str, str, Figure]]:
         "Methods that refuse or fail in some trials end below 1.",
         draw.error_distribution(records),
     )
-    for method in methods_of(records)[:2]:
+    for method in [m for m in methods_of(records) if m not in BASELINES][:2]:
         if (figure := draw.against_baselines(records, method)) is not None:
             caption = (
                 "Trajectory RMSE of each trial; below the line the method on the vertical axis is better."

@@ -247,7 +247,10 @@ def events_table(records: Sequence[TrialRecord]) -> Table:
         ("false", "false alarms"),
     )
     return Table(
-        "events", "Events", columns(*heads), rows_of([[*key, *counts] for key, counts in totals.items()])
+        "events",
+        "Events",
+        columns(*heads),
+        rows_of([[*key, *counts] for key, counts in totals.items() if any(counts)]),
     )
 
 
