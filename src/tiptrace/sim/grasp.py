@@ -143,7 +143,7 @@ class Grasp:
         return _result(R, p, wrench, pads, tip, taken)
 
     def relax(
-        self, state: GraspState, world: World, R: FloatArray, p: FloatArray, dt_s: float, limit: int = 400
+        self, state: GraspState, world: World, R: FloatArray, p: FloatArray, dt_s: float, limit: int = 250
     ) -> Equilibrium:
         """Overdamped motion from (R, p) until it rests: follows the tool through a snap, where Newton's method
         is thrown back and forth across the fold.

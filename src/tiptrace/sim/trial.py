@@ -237,6 +237,7 @@ class TrialPhysics:
                 self._guard(t)
                 T[2, 3] += self._guard_m
                 self._state = drift_anchors(self.grasp.pads, self._state, drift_rad_s * dt)
+                self._slip.rotation_deg -= float(np.degrees(drift_rad_s * dt))
                 mu, push = friction(t), tip_push(spec, t)
                 retried |= self._move(T_last, T, mu, push, dt, f"frame {index}")
                 T_last, t_last = T, t
