@@ -33,6 +33,7 @@ LAMPS = 2  # per channel
 RADII_M = (0.5e-3, 0.65e-3, 0.75e-3, 0.9e-3, 1.2e-3, 2.0e-3)
 PER_CHANNEL = 2 + 3 * LAMPS  # ambient, softness, and azimuth, elevation, strength of each lamp
 SATURATED = 254.0
+LEAST_SOFTNESS = 0.2  # lamps are bars behind a diffuser: they span some 25° as seen from the gel
 
 
 @dataclass(frozen=True)
@@ -113,7 +114,7 @@ class Fit:
             "elevation_deg": np.degrees(angles[..., 1]).round(2).tolist(),
             "strength": np.abs(angles[..., 2]).round(4).tolist(),
             "ambient": np.abs(lamps[:, 0]).round(4).tolist(),
-            "softness": (0.05 + np.abs(lamps[:, 1])).round(4).tolist(),
+            "softness": (LEAST_SOFTNESS + np.abs(lamps[:, 1])).round(4).tolist(),
             "lamp_distance_m": 0.03,
             "background": [[0.0]] * 3,
         }
@@ -140,7 +141,7 @@ class Fit:
             np.degrees(angles[..., 1]),
         )
         rounded["strength"], rounded["ambient"] = np.abs(angles[..., 2]), np.abs(lamps[:, 0])
-        rounded["softness"] = 0.05 + np.abs(lamps[:, 1])
+        rounded["softness"] = LEAST_SOFTNESS + np.abs(lamps[:, 1])
         return rounded
 
     def sparsity(self) -> lil_matrix:

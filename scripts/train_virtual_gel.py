@@ -30,7 +30,7 @@ def main() -> None:
         "--keep", type=Path, help="where to leave the presses; by default they are thrown away"
     )
     parser.add_argument(
-        "--rounds", type=int, default=2, help="how often the whole gel is covered (48 presses)"
+        "--rounds", type=int, default=4, help="how often the whole gel is covered (48 presses)"
     )
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()

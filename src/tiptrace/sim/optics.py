@@ -12,7 +12,7 @@ coefficients come from real presses (``scripts/fit_optics.py``) and lie in ``sim
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from importlib import resources
 from typing import Any
 
@@ -37,6 +37,8 @@ class Optics:
         softness: (3,) half-width of the rounding of max(·, 0).
         lamp_distance_m: Distance of the lamps; their direction turns by x / distance.
         gloss: Strength of the broad highlight, grey levels.
+        balance: (3, 3) share by which each channel's untouched colour differs from the polynomial: everywhere,
+            per half width to the right, per half height downwards.
     """
 
     background: FloatArray
@@ -46,6 +48,7 @@ class Optics:
     softness: FloatArray
     lamp_distance_m: float = 0.03
     gloss: float = 0.0
+    balance: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
 
 
 def background_powers(degree: int = 6) -> list[tuple[int, int]]:
@@ -62,7 +65,9 @@ def background_basis(x_m: FloatArray, y_m: FloatArray, degree: int = 6) -> Float
 def untouched_colour(optics: Optics, x_m: FloatArray, y_m: FloatArray) -> FloatArray:
     """Colour of the untouched gel at points, (..., 3), grey levels."""
     degree = next(d for d in range(20) if len(background_powers(d)) == optics.background.shape[1])
-    return np.asarray(np.clip(background_basis(x_m, y_m, degree) @ optics.background.T, 2, 250))
+    polynomial = background_basis(x_m, y_m, degree) @ optics.background.T
+    tilt = np.stack([np.ones_like(x_m), x_m / HALF_WIDTH_M, y_m / HALF_HEIGHT_M], axis=-1) @ optics.balance.T
+    return np.asarray(np.clip(polynomial * (1 + tilt), 2, 250))
 
 
 def irradiance(
@@ -136,11 +141,11 @@ def gel_optics(seed: int | None) -> Optics:
     if seed is None:
         return nominal
     rng = np.random.default_rng([seed, 0x6E1])
-    turned = _turn(nominal.lamp_toward, rng, np.radians(1.0))
-    strength = nominal.lamp_strength * np.exp(rng.normal(0, 0.04, nominal.lamp_strength.shape))
+    turned = _turn(nominal.lamp_toward, rng, np.radians(0.7))
+    strength = nominal.lamp_strength * np.exp(rng.normal(0, 0.03, nominal.lamp_strength.shape))
     return replace(
         nominal,
-        background=_vary_background(nominal.background, rng, 0.05),
+        balance=rng.normal(0, 0.05, (3, 3)),
         lamp_toward=turned,
         lamp_strength=strength,
         ambient=nominal.ambient * np.exp(rng.normal(0, 0.04, 3)),
@@ -155,7 +160,7 @@ def unseen_optics(seed: int) -> Optics:
     rng = np.random.default_rng([seed, 0x5EE])
     return replace(
         gel,
-        background=_vary_background(gel.background, rng, 0.10),
+        balance=gel.balance + rng.normal(0, 0.10, (3, 3)),
         lamp_toward=_turn(gel.lamp_toward, rng, np.radians(4.0)),
         lamp_strength=gel.lamp_strength * np.exp(rng.normal(0, 0.15, gel.lamp_strength.shape)),
         softness=gel.softness * float(rng.uniform(0.5, 0.7)),
@@ -168,15 +173,3 @@ def _turn(toward: FloatArray, rng: np.random.Generator, angle: float) -> FloatAr
     turned = toward + rng.normal(0, angle, toward.shape)
     turned[..., 2] = np.maximum(turned[..., 2], 0.1)
     return np.asarray(turned / np.linalg.norm(turned, axis=-1, keepdims=True))
-
-
-def _vary_background(background: FloatArray, rng: np.random.Generator, share: float) -> FloatArray:
-    """Overall level, left–right and top–bottom balance of each channel change a little."""
-    changed = background.copy()
-    powers = background_powers(next(d for d in range(20) if len(background_powers(d)) == background.shape[1]))
-    for channel in changed:
-        mean = channel[powers.index((0, 0))]
-        channel *= 1 + rng.normal(0, share)
-        channel[powers.index((1, 0))] += mean * rng.normal(0, share * 0.8)
-        channel[powers.index((0, 1))] += mean * rng.normal(0, share * 0.8)
-    return changed
