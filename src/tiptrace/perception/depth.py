@@ -17,6 +17,7 @@ from tiptrace.types import BoolArray, Image
 
 Float32Map = NDArray[np.float32]
 
+_RIM_PX = 2  # a dot's blurred rim is brighter than the marker range, yet no gel: its slopes are not the surface's
 _FLAT = 0.03  # change of slope below which gel counts as flat, m/m
 _SHALLOW = 0.25  # of the depth range: flat gel above this level is touched
 _SHALLOW_M = 60e-6  # … but never closer to the lowest gel than its noise
@@ -56,6 +57,7 @@ class PaperDepth:
         check_image(reference)
         H, W = reference.shape[:2]
         self._gel, self._threshold = gel, marker_threshold
+        self._rim = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * _RIM_PX + 1, 2 * _RIM_PX + 1))
         v, u = np.indices((H, W), dtype=np.float32)
         self._unit_uv = np.stack([u / W, v / H], axis=-1).reshape(-1, 2)  # (HW, 2)
         self._background = untouched_background(reference)
@@ -78,9 +80,9 @@ class PaperDepth:
         return DepthMap(depth_m=h, untouched=untouched, zero_visible=visible)
 
     def _slopes(self, image: Image) -> Float32Map:
-        """Slopes (H, W, 2): network where the grey level is not a marker's, nearest value elsewhere."""
+        """Slopes (H, W, 2): network off the markers (grey range, and their rims), nearest value on them."""
         grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-        masked = (grey >= self._threshold[0]) & (grey <= self._threshold[1])  # (H, W)
+        masked = cv2.dilate(cv2.inRange(grey, *self._threshold), self._rim) > 0  # (H, W)
         colours = image.astype(np.float32)
         colours = self._gel.convention.colours(colours, self._background)
         seen = ~masked.ravel()
