@@ -169,7 +169,7 @@ def test_images_of_the_wrong_size(tmp_path: Path) -> None:
 
 def test_images_of_which_none_can_be_decoded(tmp_path: Path) -> None:
     both = [with_message(row, data=b"\xff\xd8") if row[0] in IMAGE_TOPIC.values() else row for row in rows()]
-    assert "25 images cannot be decoded" in refusal(tmp_path, both)
+    assert "images that cannot be decoded, left out: 25" in refusal(tmp_path, both)
 
 
 # --- clocks --------------------------------------------------------------------------------------------------
@@ -234,7 +234,7 @@ def test_repeated_and_unordered_stamps_are_sorted_and_noted(tmp_path: Path) -> N
     path = write_raw(tmp_path / "trial.mcap", edited(POSE_TOPIC, shake), **RIG)
     recording = Recording(path)
     assert len(list(synchronise(recording))) == 25
-    assert any("repeats" in note for note in recording.notes)
+    assert any("repeated stamps" in note for note in recording.notes)
     assert any("out of order by up to 0.020 s" in note for note in recording.notes)
 
 

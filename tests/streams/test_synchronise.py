@@ -177,7 +177,7 @@ def test_repeated_and_late_images_are_left_out_and_counted() -> None:
     assert len(found) == 50
     assert report.late["left"] + report.repeated["left"] == 1
     assert report.repeated["right"] == 1
-    assert any("repeated a stamp" in sentence for sentence in report.sentences())
+    assert any("repeat a stamp" in sentence for sentence in report.sentences())
 
 
 def test_phase_is_none_before_the_first_mark_and_without_marks() -> None:

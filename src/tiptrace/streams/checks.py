@@ -77,7 +77,7 @@ def check_order(where: str, topic: str, stamps: Stamps_ns) -> list[str]:
     notes = []
     repeats = len(stamps) - len(np.unique(stamps))
     if repeats:
-        notes.append(f"{topic}: {repeats} of {len(stamps)} stamps are repeats; the repeats are left out")
+        notes.append(f"{topic}: repeated stamps, left out: {repeats} of {len(stamps)}")
     if back_s > 0:
         notes.append(f"{topic}: stamps are out of order by up to {back_s:.3f} s; sorted")
     return notes

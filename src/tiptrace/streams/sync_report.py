@@ -55,17 +55,17 @@ class SyncReport:
         found = []
         for side in SIDES:
             for counts, what in (
-                (self.unpaired, "had no partner and were left out"),
-                (self.repeated, "repeated a stamp and were left out"),
-                (self.late, "came too late and were left out"),
+                (self.unpaired, "without a partner"),
+                (self.repeated, "that repeat a stamp"),
+                (self.late, "that came too late"),
             ):
                 if counts[side]:
-                    found.append(f"{counts[side]} of {self.images[side]} {side} images {what}")
+                    found.append(f"{side} images {what}, left out: {counts[side]} of {self.images[side]}")
         if self.poses_dropped:
-            found.append(f"{self.poses_dropped} of {self.poses} poses repeated a stamp or came too late")
+            found.append(f"poses that repeat a stamp or came too late: {self.poses_dropped} of {self.poses}")
         if self.pairs_without_pose:
             details = "; ".join(dict.fromkeys(event.detail for event in self.gaps[:3]))
-            found.append(f"{self.pairs_without_pose} image pairs had no pose and were left out: {details}")
+            found.append(f"image pairs without a pose, left out: {self.pairs_without_pose} ({details})")
         return found
 
 

@@ -208,7 +208,7 @@ class TrialReader:
         """
         for topic, times in self._decode.undecodable.items():
             note = (
-                f"{topic}: {len(times)} images cannot be decoded and are left out "
+                f"{topic}: images that cannot be decoded, left out: {len(times)} "
                 f"(the first at {self._since_start_s(times[0]):.2f} s)"
             )
             if not tactile:
