@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from tiptrace.evaluation.suite_tables import BASELINES
 from tiptrace.evaluation.truth import Truth
 from tiptrace.evaluation.truth_files import read_truth
 from tiptrace.pipeline import Step, open_tracer, replay, trace
+from tiptrace.reconstruction import Trial, reconstruct
 from tiptrace.sim.simulation import START_NS, Frame
 from tiptrace.sim.spec import make_spec
 from tiptrace.streams.simulated import SimulatedStream
@@ -49,20 +50,26 @@ def run_trial(task: TrialTask, methods: Sequence[str]) -> TrialRun:
         TipTraceError: the trial cannot be read or simulated; the failure of a single method is in the result.
     """
     source = json.loads(task.source)
-    if "spec" in source:
-        simulated = _Collected.simulate(source["spec"])
-        stream: Stream = simulated
-        truth, events = simulated.truth, simulated.true_events
-    else:
-        recording = open_recording(Path(source["path"]), **_paths(source.get("options", {})))
-        stream, events = recording, None
-        samples = read_truth(Path(source["truth"])) if source.get("truth") else recording.truth()
-        truth = Truth.from_samples(samples) if samples else None
+    stream, events = _open(source)
+    task = _described(task, stream.trial)
+    samples = read_truth(Path(source["truth"])) if source.get("truth") else stream.truth()
     found = _Traced(stream)
     for method in methods:
         found.add(method)
-    analytic = _analytic(found, truth, source["analytic"]) if source.get("analytic") else None
-    return TrialRun(found.trajectories, truth, analytic, found.failures, events)
+    truth = Truth.from_samples(samples) if samples else None
+    analytic = _analytic(found, truth, source["analytic"], task) if source.get("analytic") else None
+    return TrialRun(found.trajectories, truth, analytic, found.failures, events, task)
+
+
+def report_trial(task: TrialTask, methods: Sequence[str], folder: Path) -> Path | None:
+    """Results and report of a single trial in a folder of its own.
+
+    Raises:
+        TipTraceError: the trial cannot be run.
+    """
+    stream, _ = _open(json.loads(task.source))
+    result = reconstruct(stream, folder, methods[0], beside=methods[1:], title=task.name, source=task.name)
+    return result.report
 
 
 def simulated_source(spec: dict[str, Any], analytic: dict[str, Any] | None = None) -> str:
@@ -86,18 +93,23 @@ def recording_source(
     return json.dumps(values, sort_keys=True)
 
 
-def recording_task(path: Path, name: str, source: str, options: dict[str, str] | None = None) -> TrialTask:
-    """Task for a recording, with its condition and seed where its metadata name them; unreadable ones have none."""
-    try:
-        trial = getattr(open_recording(path, **_paths(options or {})), "trial", {})
-    except TipTraceError:
-        trial = {}
+def _open(source: dict[str, Any]) -> tuple[Trial, tuple[Event, ...] | None]:
+    """The trial of a source, and what really happened in it, where that is known."""
+    if "spec" in source:
+        simulated = _Collected.simulate(source["spec"])
+        return simulated, simulated.true_events
+    plain = {"reference_frames", "stamps"}
+    options: dict[str, Any] = {k: v if k in plain else Path(v) for k, v in source.get("options", {}).items()}
+    return open_recording(Path(source["path"]), **options), None
+
+
+def _described(task: TrialTask, trial: dict[str, Any]) -> TrialTask:
+    """The task with condition, level and seed where a recording's metadata name them."""
     parts = [trial.get(key) for key in ("trajectory", "tool", "wrist", "grasp")]
-    condition = Condition(*map(str, parts)) if all(parts) else None
-    seed = trial.get("seed")
-    return TrialTask(
-        name, source, condition, str(trial.get("level", "")), seed if isinstance(seed, int) else None
-    )
+    condition = Condition(*map(str, parts)) if all(parts) else task.condition
+    seed = trial.get("seed", task.seed)
+    level = str(trial.get("level", task.level))
+    return replace(task, condition=condition, level=level, seed=seed if isinstance(seed, int) else None)
 
 
 @dataclass
@@ -149,8 +161,10 @@ class _Collected:
     tool: Tool | None
     references: dict[Side, Image]
     gel_models: dict[str, bytes]
+    trial: dict[str, Any]
     samples: list[Sample]
     true_events: tuple[Event, ...]
+    notes: list[str] = field(default_factory=list)
 
     @classmethod
     def simulate(cls, values: dict[str, Any]) -> _Collected:
@@ -158,15 +172,14 @@ class _Collected:
         stream = SimulatedStream(make_spec(**values), frames.append)
         samples = list(stream)
         events = (*_runs(frames, "contact-lost"), *_runs(frames, "grasp-slip"))
-        return cls(stream.rig, stream.tool, stream.references, stream.gel_models, samples, events)
+        trial = stream.trial_metadata
+        return cls(stream.rig, stream.tool, stream.references, stream.gel_models, trial, samples, events)
 
     def __iter__(self) -> Iterator[Sample]:
         return iter(self.samples)
 
-    @property
-    def truth(self) -> Truth | None:
-        samples = [s for s in self.samples if isinstance(s, TruthSample)]
-        return Truth.from_samples(samples) if samples else None
+    def truth(self) -> list[TruthSample]:
+        return [s for s in self.samples if isinstance(s, TruthSample)]
 
 
 def _runs(frames: Sequence[Frame], kind: str) -> Iterator[Event]:
@@ -180,9 +193,11 @@ def _runs(frames: Sequence[Frame], kind: str) -> Iterator[Event]:
             yield Event(kind, start, end, "true")
 
 
-def _analytic(found: _Traced, truth: Truth | None, wanted: dict[str, Any]) -> Truth | None:
+def _analytic(found: _Traced, truth: Truth | None, wanted: dict[str, Any], task: TrialTask) -> Truth | None:
     """The paper's ground truth: a named centreline from a measured start."""
     name = wanted["centreline"]
+    if name == "auto":
+        name = task.condition.trajectory if task.condition else "auto"
     if name not in CENTRELINES:
         raise ConfigError(f"unknown centreline '{name}'; valid: {', '.join(CENTRELINES)}")
     trajectory = next(iter(found.trajectories.values()), None)
@@ -196,9 +211,3 @@ def _analytic(found: _Traced, truth: Truth | None, wanted: dict[str, Any]) -> Tr
     end = max(e.stamp_ns for e in trajectory.estimates if e.phase is Phase.ANCHORING)
     yaw_rad = float(np.radians(wanted.get("yaw_deg", 0.0)))
     return Truth.from_samples(analytic_truth(CENTRELINES[name], start, found.poses, end, yaw_rad))
-
-
-def _paths(options: dict[str, str]) -> dict[str, Any]:
-    """Options of ``open_recording`` as it takes them."""
-    plain = {"reference_frames", "stamps"}
-    return {k: v if k in plain else Path(v) for k, v in options.items()}

@@ -47,7 +47,7 @@ def test_overall_is_mean_and_std_over_trials_with_the_published_row():
     table = overall_table(records)
     paper = [r.value("trajectory_rmse_mm") for r in records if r.method == "paper" and r.metrics]
     row = table.text_rows()[1]
-    assert row[:2] == ["paper", "48"]
+    assert row[:2] == ["paper", "47 of 48"]
     assert row[2] == f"{np.mean(paper):.2f} ± {np.std(paper, ddof=1):.2f}"
     last = table.text_rows()[-1]
     assert last[0] == "published, hardware, n = 51"

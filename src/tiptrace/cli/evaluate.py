@@ -5,11 +5,13 @@ from __future__ import annotations
 import os
 import shlex
 import sys
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+_MOST_REPORTS = 5
 
 if TYPE_CHECKING:
     from tiptrace.evaluation.records import TrialRecord
@@ -72,6 +74,7 @@ def evaluate(
 
     from tiptrace.errors import ConfigError
     from tiptrace.evaluation.suite_store import SuiteStore
+    from tiptrace.trial_plan import recording_tasks, suite_tasks
 
     names = [m.strip() for m in methods.split(",") if m.strip()]
     _check_methods(names)
@@ -80,16 +83,18 @@ def evaluate(
     console, store = Console(), SuiteStore(out)
     settings = {"methods": ",".join(names), "analytic": analytic or "", "start": start or ""}
     if suite:
-        tasks = _suite_tasks(suite, level, mode, seed, analytic)
+        tasks = suite_tasks(suite, level, mode, seed, analytic)
         settings |= {"suite": suite, "level": level, "mode": mode, "seed": str(seed)}
     else:
         given = {"map_file": map_file, "rig": rig, "reference_frames": reference_frames}
         options = {key: str(value) for key, value in given.items() if value is not None}
-        tasks, notes = _recording_tasks(paths or [], truth, analytic, start, options)
+        settings |= {"truth": str(truth or ""), **options}
+        tasks, notes = recording_tasks(paths or [], truth, analytic, _start(start), options)
         for note in notes:
             console.print(f"note: {note}", highlight=False, markup=False)
     store.claim(settings)
     records = _run(tasks, names, store, workers or os.cpu_count() or 1, scheduler)
+    records = _report_outliers(tasks, names, store, records)
     page = _report(store, records, settings, suite)
     _show(console, records, page)
     if any(r.failure for r in records):
@@ -103,67 +108,6 @@ def _check_methods(names: list[str]) -> None:
     unknown = [m for m in names if m not in METHODS]
     if unknown or not names:
         raise ConfigError(f"unknown method(s) {', '.join(unknown) or '–'}; valid: {', '.join(METHODS)}")
-
-
-def _suite_tasks(suite: str, level: str, mode: Any, seed: int, analytic: str | None) -> list[TrialTask]:
-    from tiptrace.evaluation.conditions import Condition
-    from tiptrace.evaluation.runner import TrialTask
-    from tiptrace.sim.suite import suite_trials
-    from tiptrace.trial_runs import simulated_source
-
-    tasks = []
-    for trial in suite_trials(suite, level, mode, seed):
-        spec = trial.spec
-        condition = Condition(spec.trajectory, spec.tool, spec.wrist, spec.grasp)
-        curve = {"centreline": spec.trajectory if analytic == "auto" else analytic} if analytic else None
-        source = simulated_source(spec.model_dump(mode="json", exclude_none=True), curve)
-        tasks.append(TrialTask(trial.name, source, condition, spec.level, spec.seed))
-    return tasks
-
-
-def _recording_tasks(
-    paths: list[Path], truth: Path | None, analytic: str | None, start: str | None, options: dict[str, str]
-) -> tuple[list[TrialTask], list[str]]:
-    """Tasks in the order given, each file once; and what a user should know of them."""
-    from tiptrace.trial_runs import recording_source, recording_task
-
-    found, notes = _expand(paths)
-    tasks = []
-    for path in found:
-        task = recording_task(path, str(path), "", options)
-        curve = None
-        if analytic is not None:
-            name = task.condition.trajectory if analytic == "auto" and task.condition else analytic
-            curve = {"centreline": name, "start_m": _start(start)}
-        source = recording_source(path, _truth_of(path, truth), curve, options)
-        tasks.append(type(task)(task.name, source, task.condition, task.level, task.seed))
-    return tasks, notes
-
-
-def _expand(paths: list[Path]) -> tuple[list[Path], list[str]]:
-    """Recordings in folders; bags that are folders stay whole."""
-    from tiptrace.errors import ConfigError
-
-    found: dict[Path, Path] = {}
-    notes = []
-    for path in paths:
-        is_bag = path.is_dir() and (path / "metadata.yaml").exists()
-        inside = sorted(path.rglob("*.mcap")) if path.is_dir() and not is_bag else [path]
-        if not inside:
-            raise ConfigError(f"{path}: holds no recording (*.mcap)")
-        for recording in inside:
-            if recording.resolve() in found:
-                notes.append(f"{recording}: given more than once, evaluated once")
-            found.setdefault(recording.resolve(), recording)
-    return list(found.values()), notes
-
-
-def _truth_of(recording: Path, truth: Path | None) -> Path | None:
-    """Truth file of a recording: the file itself, or the one of its name in a folder."""
-    if truth is None or not truth.is_dir():
-        return truth
-    named = (truth / f"{recording.stem}{suffix}" for suffix in (".tum", ".csv"))
-    return next((path for path in named if path.exists()), None)
 
 
 def _start(text: str | None) -> list[float] | None:
@@ -204,6 +148,30 @@ def _run(
             on_done=lambda _: progress.advance(bar),
         )
         return run.run(tasks)
+
+
+def _report_outliers(
+    tasks: list[TrialTask], methods: list[str], store: SuiteStore, records: list[TrialRecord]
+) -> list[TrialRecord]:
+    """Run the worst trials again, each with a report of its own, and link them."""
+    from dataclasses import replace
+
+    from tiptrace.cli.show import progress_bar
+    from tiptrace.errors import TipTraceError
+    from tiptrace.evaluation.suite_store import file_name
+    from tiptrace.evaluation.suite_tables import outliers
+    from tiptrace.trial_runs import report_trial
+
+    worst = {r.trial for r in outliers(records, methods[0])[:_MOST_REPORTS]}
+    links: dict[str, str] = {}
+    with progress_bar() as progress:
+        for task in progress.track([t for t in tasks if t.name in worst], description="reports of outliers"):
+            folder = store.folder / "outliers" / file_name(task.name)
+            page = folder / "report.html"
+            with suppress(TipTraceError):  # it is in the table of failures
+                if page.exists() or report_trial(task, methods, folder) is not None:
+                    links[task.name] = str(page.relative_to(store.folder))
+    return [replace(r, report=links.get(r.trial, "")) for r in records]
 
 
 def _report(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tiptrace.evaluation import published, style
-from tiptrace.evaluation.conditions import CONDITION_SETS, VARIED, Condition
+from tiptrace.evaluation.conditions import CONDITION_SETS, VARIED, Condition, sets_of
 from tiptrace.evaluation.records import TrialRecord
 from tiptrace.evaluation.statistics import spearman, summarise
 from tiptrace.evaluation.suite_tables import BASELINES, aligned, methods_of, set_values, values_by_trial
@@ -91,11 +91,12 @@ def overlays(traces: Iterable[tuple[Condition, TrialTraces]], method: str) -> Fi
     by_condition: dict[Condition, list[TrialTraces]] = {}
     for condition, trace in traces:
         by_condition.setdefault(condition, []).append(trace)
-    columns = max(len(c) for c in CONDITION_SETS.values())
-    figure = style.new_figure(9.6, 6.4)
-    axes = figure.subplots(len(CONDITION_SETS), columns, sharex=True, sharey="row", squeeze=False)
+    sets = _sets_with(by_condition)
+    columns = max((len(c) for c in sets.values()), default=1)
+    figure = style.new_figure(max(4.0, 1.92 * columns), 0.4 + 1.5 * max(1, len(sets)))
+    axes = figure.subplots(max(1, len(sets)), columns, sharex=True, sharey="row", squeeze=False)
     colour, _ = style.method_style(method)
-    for row, (name, conditions) in zip(axes, CONDITION_SETS.items(), strict=True):
+    for row, (name, conditions) in zip(axes, sets.items(), strict=False):
         for ax, condition in zip(row, conditions, strict=False):
             found = by_condition.get(condition, [])
             _overlay(ax, found, method, colour)
@@ -185,6 +186,13 @@ def error_budget(budget: Mapping[str, Sequence[TrialRecord]], metric: str = "tra
     ax.set_title("One disturbance at a time: mean over trials, whisker to the 95th percentile")
     figure.legend(loc="outside lower center", ncols=len(methods))
     return figure
+
+
+def _sets_with(found: Mapping[Condition, object]) -> dict[str, list[Condition]]:
+    """The paper's sets with the conditions that have traces; others in a set of their own."""
+    sets = {name: [c for c in conditions if c in found] for name, conditions in CONDITION_SETS.items()}
+    sets["other"] = [c for c in found if not sets_of(c)]
+    return {name: conditions for name, conditions in sets.items() if conditions}
 
 
 def _overlay(ax: Axes, traces: Sequence[TrialTraces], method: str, colour: str) -> None:

@@ -53,6 +53,7 @@ class TrialRun:
         analytic: The paper's analytic truth, where asked for.
         failures: Why a method gave no trajectory, by method.
         true_events: What really happened; None where nobody knows.
+        task: The task with what its source told of condition, level and seed; None where it told nothing.
     """
 
     trajectories: Mapping[str, TipTrajectory]
@@ -60,6 +61,7 @@ class TrialRun:
     analytic: Truth | None = None
     failures: Mapping[str, str] = field(default_factory=dict)
     true_events: tuple[Event, ...] | None = None
+    task: TrialTask | None = None
 
 
 class RunTrial(Protocol):
@@ -87,7 +89,8 @@ def evaluate_trial(run_trial: RunTrial, task: TrialTask, methods: Sequence[str])
         return failed(task, methods, str(error))
     except Exception as error:  # noqa: BLE001 - one trial among thousands must not end the others
         return failed(task, methods, f"internal error, {type(error).__name__}: {error}")
-    records = tuple(_record(task, run, method) for method in methods)
+    known = run.task or task
+    records = tuple(_record(known, run, method) for method in methods)
     traces = TrialTraces.of(run.trajectories, run.truth) if run.trajectories else None
     return TrialResult(task, records, traces)
 

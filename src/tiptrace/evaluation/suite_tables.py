@@ -67,11 +67,13 @@ def overall_table(records: Sequence[TrialRecord]) -> Table:
     names = (*MAIN_METRICS, "cross_track_rmse_mm", "along_track_rmse_mm", "loop_rate_hz")
     rows: list[list[Cell]] = []
     for method in methods_of(records):
-        trials = {r.trial for r in records if r.method == method}
+        trials = {r.trial: bool(r.failure) for r in records if r.method == method}
+        lost = sum(trials.values())
+        count = f"{len(trials) - lost} of {len(trials)}" if lost else len(trials)
         summaries = [summarise(list(values_by_trial(records, method, name).values())) for name in names]
         rate = summaries[-1]
         span = "–" if rate.n == 0 else f"{rate.min:.1f} … {rate.max:.1f}"
-        rows.append([method, len(trials), *(mean_std(s.mean, s.std) for s in summaries), span])
+        rows.append([method, count, *(mean_std(s.mean, s.std) for s in summaries), span])
     paper = (published.PUBLISHED.get(name) for name in names)
     low, high = published.LOOP_RATE_RANGE_HZ
     cells = ["–" if p is None else mean_std(p.mean, p.std) for p in paper]

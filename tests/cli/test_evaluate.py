@@ -1,0 +1,88 @@
+"""``tiptrace evaluate`` on recordings: good ones, bad ones, truth from elsewhere."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import typer
+import yaml
+from typer.testing import CliRunner, Result
+
+from tiptrace.cli.evaluate import evaluate
+from tiptrace.cli.simulate import simulate
+from tiptrace.errors import ConfigError
+from tiptrace.streams.recording import Recording
+
+
+def run(*arguments: object) -> Result:
+    app = typer.Typer()
+    app.command()(evaluate)
+    return CliRunner().invoke(app, [str(a) for a in arguments])
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A short trial at marker level."""
+    folder = tmp_path_factory.mktemp("trial")
+    settings = {"travel_m": 0.01, "fps": 5.0, "anchoring_s": 2.0, "mode": "markers", "level": "clean"}
+    (folder / "settings.yaml").write_text(yaml.safe_dump(settings))
+    simulate(out=folder / "good.mcap", settings=folder / "settings.yaml", seed=1)
+    return folder / "good.mcap"
+
+
+def rows(out: Path, table: str) -> list[dict[str, object]]:
+    found: list[dict[str, object]] = json.loads((out / "tables" / "tables.json").read_text())[table]["rows"]
+    return found
+
+
+def test_an_unreadable_file_is_reported_and_the_rest_goes_on(recording: Path, tmp_path: Path):
+    bad = tmp_path / "bad.mcap"
+    bad.write_text("nope")
+    out = tmp_path / "out"
+    result = run(recording, recording, bad, "--analytic", "auto", "--out", out, "--workers", 1)
+    assert result.exit_code == 1
+    assert "given more than once" in result.output
+    assert {r["trial"] for r in rows(out, "failures")} == {str(bad)}
+    paper, ee_only, published = rows(out, "overall")
+    assert (paper["method"], paper["trials"]) == ("paper", "1 of 2")
+    assert published["trajectory_rmse_mm"] == "8.59 ± 2.41"
+    assert ee_only["trajectory_rmse_mm"] != "–"
+    assert len(rows(out, "analytic")) == 2
+    assert (out / "report.html").exists()
+    assert (out / "trials.parquet").exists()
+
+
+def test_truth_may_come_from_a_file(recording: Path, tmp_path: Path):
+    samples = Recording(recording).truth()
+    lines = [f"{s.stamp_ns},{s.p_B[0]},{s.p_B[1]},{s.p_B[2] + 0.5}" for s in samples]
+    truth = tmp_path / "truth.csv"
+    truth.write_text("\n".join(["stamp_ns,x_m,y_m,z_m", *lines]))
+    out = tmp_path / "out"
+    result = run(recording, "--methods", "paper", "--truth", truth, "--out", out, "--workers", 1)
+    assert result.exit_code == 0, result.output
+    error = rows(out, "overall")[0]["trajectory_rmse_mm"]
+    assert isinstance(error, str)
+    assert float(error) == pytest.approx(500.0, abs=5.0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ((), "give recordings"),
+        (("x.mcap", "--suite", "quick"), "give recordings"),
+        (("x.mcap", "--methods", "magic"), "magic"),
+        (("x.mcap", "--start", "1,2"), "x,y,z"),
+    ],
+)
+def test_wrong_requests_are_refused(arguments: tuple[str, ...], words: str, tmp_path: Path):
+    result = run(*arguments, "--out", tmp_path / "out", "--analytic", "T1")
+    assert isinstance(result.exception, ConfigError)
+    assert words in str(result.exception)
+
+
+def test_a_folder_without_recordings_is_refused(tmp_path: Path):
+    result = run(tmp_path, "--out", tmp_path / "out")
+    assert isinstance(result.exception, ConfigError)
+    assert "holds no recording" in str(result.exception)
