@@ -155,11 +155,21 @@ def test_no_pose_is_extrapolated_or_taken_across_a_gap() -> None:
     stamps = {(o.stamp_ns - T0) // MS for o in found}
     assert stamps == {ms for ms in range(0, 1000, 40) if 100 <= ms <= 400 or 700 <= ms <= 900}
     assert report.pairs_without_pose == 25 - len(found)
-    assert [e.kind for e in report.gaps] == ["pose-gap"] * 3
+    (event,) = report.gaps  # the poses begin and end within 0.2 s of the images
+    assert (event.kind, event.start_ns, event.end_ns) == ("pose-gap", T0 + 440 * MS, T0 + 680 * MS)
     text = " ".join(report.sentences())
     assert "begin before the robot's poses" in text
     assert "pause for 0.30 s" in text
     assert "go on after the robot's poses" in text
+
+
+def test_poses_that_end_for_good_are_an_event() -> None:
+    images = [image(side, ms) for ms in range(0, 2000, 40) for side in SIDES]
+    found, report = run(sorted([*images, *poses(-10, 1001)], key=lambda s: s.stamp_ns))
+    assert len(found) == 26
+    (event,) = report.gaps
+    assert (event.start_ns, event.end_ns) == (T0 + 1040 * MS, T0 + 1960 * MS)
+    assert report.pairs_without_pose == 24
 
 
 def test_a_gap_below_the_limit_is_interpolated() -> None:

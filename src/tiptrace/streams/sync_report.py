@@ -8,6 +8,8 @@ from tiptrace.streams.pose_track import PoseGap
 from tiptrace.streams.topics import NS
 from tiptrace.types import SIDES, Event, Side
 
+_END_NS = round(0.2 * NS)  # so much later or earlier than the images the poses may begin or end
+
 
 def _per_side() -> dict[Side, int]:
     return {"left": 0, "right": 0}
@@ -26,7 +28,8 @@ class SyncReport:
         poses: Pose samples delivered.
         poses_dropped: Pose samples whose stamp had been seen or whose time had passed.
         pairs_without_pose: Pairs skipped because no pose could be claimed.
-        gaps: One ``pose-gap`` event per hole in the pose stream that cost pairs.
+        gaps: One ``pose-gap`` event per hole in the pose stream that cost pairs; before its first and after its
+            last sample only where that lasts.
     """
 
     images: dict[Side, int] = field(default_factory=_per_side)
@@ -39,16 +42,24 @@ class SyncReport:
     pairs_without_pose: int = 0
     gaps: list[Event] = field(default_factory=list)
     _last_gap: PoseGap | None = None
+    _gap_start_ns: int = 0
+    _causes: list[str] = field(default_factory=list)
 
     def add_gap(self, stamp_ns: int, gap: PoseGap) -> None:
         """Note a pair that had to be skipped."""
         self.pairs_without_pose += 1
-        if self.gaps and self._last_gap is not None and gap.before_ns == self._last_gap.before_ns:
-            last = self.gaps[-1]
-            self.gaps[-1] = Event(last.kind, last.start_ns, stamp_ns, last.detail)
-        else:
-            self.gaps.append(Event("pose-gap", stamp_ns, stamp_ns, _explain(gap)))
-        self._last_gap = gap
+        same = self._last_gap is not None and gap.before_ns == self._last_gap.before_ns
+        start_ns = self._gap_start_ns if same else stamp_ns
+        self._last_gap, self._gap_start_ns = gap, start_ns
+        cause = _explain(gap)
+        if cause not in self._causes and len(self._causes) < 3:
+            self._causes.append(cause)
+        at_an_end = gap.before_ns is None or gap.after_ns is None
+        if at_an_end and stamp_ns - start_ns < _END_NS:
+            return  # streams do not begin and end at the same instant
+        if self.gaps and self.gaps[-1].start_ns == start_ns:
+            self.gaps.pop()
+        self.gaps.append(Event("pose-gap", start_ns, stamp_ns, cause))
 
     def sentences(self) -> list[str]:
         """What a user should know, one sentence each; empty if nothing was lost."""
@@ -64,8 +75,8 @@ class SyncReport:
         if self.poses_dropped:
             found.append(f"poses that repeat a stamp or came too late: {self.poses_dropped} of {self.poses}")
         if self.pairs_without_pose:
-            details = "; ".join(dict.fromkeys(event.detail for event in self.gaps[:3]))
-            found.append(f"image pairs without a pose, left out: {self.pairs_without_pose} ({details})")
+            causes = "; ".join(self._causes)
+            found.append(f"image pairs without a pose, left out: {self.pairs_without_pose} ({causes})")
         return found
 
 
