@@ -95,14 +95,12 @@ class DotTruth:
     Attributes:
         uv_px: (n, 2) centres in the image.
         x_S: (n, 3) what the dots show: their positions in F_S, m, at the height of the surface over them.
-        surface_S: (n, 3) the surface points that lie over the dots at rest, where they really went, m.
         outline_px: (n, 2, 2) map from the unit disc to the dot's outline in pixels.
         px_per_metre: (2,).
     """
 
     uv_px: FloatArray
     x_S: FloatArray
-    surface_S: FloatArray
     outline_px: FloatArray
     px_per_metre: FloatArray
 
@@ -126,8 +124,7 @@ def place_dots(
     px = 1 / np.asarray(metres_per_px)
     centre = (np.asarray(size_px) - 1) / 2
     outline = px[:, None] * (F @ dots.shape * dots.radius_m[:, None, None])
-    surface = np.column_stack([rest, np.zeros(n)]) + deformation.displacement(rest)
-    return DotTruth(at[:, :2] * px + centre, at, surface, outline, px)
+    return DotTruth(at[:, :2] * px + centre, at, outline, px)
 
 
 def _bounded(F: FloatArray) -> FloatArray:
