@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tiptrace.calibration.gel_circles import PressSamples, contact_samples, find_circles
+from tiptrace.calibration.gel_circles import PressSamples, contact_samples, find_circles, in_one_place
 from tiptrace.calibration.gel_data import Circle, PressFolder, read_press_folder
 from tiptrace.calibration.gel_evaluation import PressScore, measured_slopes, score_press
 from tiptrace.calibration.gel_network import HIDDEN, Progress, train_network
@@ -17,8 +17,8 @@ from tiptrace.calibration.gel_shading import Shading, fit_shading
 from tiptrace.perception.gel_model import Convention, GelModel
 from tiptrace.types import FloatArray
 
-_ONE_PLACE = 0.25  # of the image's width and height that the contacts must span to teach the place
 _HELD_OUT = 5  # every fifth press
+_PIXELS = 100_000  # for the final shading model
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,15 +85,15 @@ def train_gel(
     tell = progress or (lambda _label, _share: None)
     data = read_press_folder(folder, mm_per_px)
     tell("finding the contacts", 0.0)
-    valid_guess = [p.circle for p in data.presses]
-    circles, _ = find_circles(data, 1 if None in valid_guess else 2)
-    valid, one_place = _coverage(data, circles)
+    circles = find_circles(data)
+    one_place = in_one_place(circles, data)
     rng = np.random.default_rng(seed)
     test = set(rng.permutation(len(circles))[: max(len(circles) // _HELD_OUT, 1)].tolist())
     train = [i for i in range(len(circles)) if i not in test]
     shading = shading_of(data, circles, train, one_place=one_place)
     convention = Convention(background="ratio", coordinates="zero" if one_place else "unit")
     network = train_network(shading, data.background, pixel_noise(data), convention, rng, tell)
+    valid = _coverage(circles)
     metadata = _metadata(data, valid, shading)
     out.write_bytes(mlp_to_onnx(network.weights, network.biases, convention, metadata=metadata))
     gel = GelModel(out.read_bytes(), str(out))
@@ -121,9 +121,10 @@ def train_gel(
 
 def shading_of(data: PressFolder, circles: list[Circle], which: list[int], *, one_place: bool) -> Shading:
     """Shading model from some of the presses."""
-    parts = [contact_samples(data.presses[i], circles[i], data) for i in which]
+    most = max(_PIXELS // len(which), 200)
+    parts = [contact_samples(data.presses[i], circles[i], data, most=most) for i in which]
     stacked = [np.concatenate([getattr(p, name) for p in parts]) for name in PressSamples.__slots__]
-    return fit_shading(*stacked, place_degree=0 if one_place else 2)
+    return fit_shading(*stacked, place_degree=0 if one_place else 1)
 
 
 def pixel_noise(data: PressFolder) -> FloatArray:
@@ -132,13 +133,11 @@ def pixel_noise(data: PressFolder) -> FloatArray:
     return np.asarray(0.5 * 1.4826 * np.median(np.abs(residual), axis=(0, 1)) + 0.2)
 
 
-def _coverage(data: PressFolder, circles: list[Circle]) -> tuple[tuple[float, float, float, float], bool]:
-    """Rectangle that the contacts cover, and whether it is too small."""
+def _coverage(circles: list[Circle]) -> tuple[float, float, float, float]:
+    """Rectangle (u_min, v_min, u_max, v_max) that the contacts cover, px."""
     c = np.array([(c.u, c.v, c.radius) for c in circles])
-    H, W = data.reference.shape[:2]
     low, high = np.min(c[:, :2] - c[:, 2:], axis=0), np.max(c[:, :2] + c[:, 2:], axis=0)
-    spread = np.ptp(c[:, :2], axis=0) / (W, H)
-    return (float(low[0]), float(low[1]), float(high[0]), float(high[1])), bool((spread < _ONE_PLACE).any())
+    return float(low[0]), float(low[1]), float(high[0]), float(high[1])
 
 
 def _metadata(data: PressFolder, valid: tuple[float, ...], shading: Shading) -> dict[str, str]:

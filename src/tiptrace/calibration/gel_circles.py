@@ -18,8 +18,11 @@ from tiptrace.errors import CalibrationError
 from tiptrace.perception.fill import smooth_fill
 from tiptrace.types import FloatArray
 
-_ROUNDS = 6
-_MISFIT = 3.0  # residual, in units of the typical one in the middle, at which the contact ends
+_ROUNDS = 5
+_ONE_PLACE = 0.25  # of the width and height of the image
+_FIT_PIXELS = 600  # of each press while circles are sought
+_MISFIT = 2.5  # residual, in units of the usual one, at which the contact ends
+_GROWTH = 1.1  # the contact ends at most this much beyond the strongest colour change
 _NOT_STEEPER = 0.94  # sine of the steepest slope taken from a ball
 
 
@@ -33,23 +36,33 @@ class PressSamples:
     background: FloatArray
 
 
-def find_circles(folder: PressFolder, place_degree: int) -> tuple[list[Circle], Shading]:
-    """Contact circle of every press, and the shading that they agree on.
+def find_circles(folder: PressFolder) -> list[Circle]:
+    """Contact circle of every press. Circles that the user gives are not needed and not believed.
 
     Raises:
         CalibrationError: a press that changes the image too little to be found.
     """
-    circles = [press.circle or _from_colour_change(press, folder) for press in folder.presses]
-    limits = [ball_radius_px(press, folder) * _NOT_STEEPER for press in folder.presses]
-    inner = [0.6] * len(circles)
-    shading = _fit(folder, circles, inner, place_degree)
+    circles = [_from_colour_change(press, folder) for press in folder.presses]
+    limits = [
+        min(_NOT_STEEPER * ball_radius_px(press, folder), _GROWTH * circle.radius)
+        for press, circle in zip(folder.presses, circles, strict=True)
+    ]
+    place_degree = 0 if in_one_place(circles, folder) else 1
+    shading = _fit(folder, circles, 0.8, place_degree)
     for _ in range(_ROUNDS):
         circles = [
             _refine(press, circle, shading, folder, limit)
             for press, circle, limit in zip(folder.presses, circles, limits, strict=True)
         ]
-        shading = _fit(folder, circles, [0.95] * len(circles), place_degree)
-    return circles, shading
+        shading = _fit(folder, circles, 0.95, place_degree)
+    return circles
+
+
+def in_one_place(circles: list[Circle], folder: PressFolder) -> bool:
+    """Whether the contacts span too little of the gel to teach how colours depend on the place."""
+    H, W = folder.reference.shape[:2]
+    spread = np.ptp([(c.u, c.v) for c in circles], axis=0) / (W, H)
+    return bool((spread < _ONE_PLACE).any())
 
 
 def ball_radius_px(press: Press, folder: PressFolder) -> float:
@@ -57,8 +70,10 @@ def ball_radius_px(press: Press, folder: PressFolder) -> float:
     return 0.5 * press.ball_diameter_mm / float(np.mean(folder.mm_per_px))
 
 
-def contact_samples(press: Press, circle: Circle, folder: PressFolder, share: float = 0.95) -> PressSamples:
-    """Pixels within a share of the contact radius, dots left out."""
+def contact_samples(
+    press: Press, circle: Circle, folder: PressFolder, share: float = 0.95, most: int = 100_000
+) -> PressSamples:
+    """Pixels within a share of the contact radius, dots left out; every k-th if there are too many."""
     H, W = folder.reference.shape[:2]
     r = share * circle.radius
     u0, u1 = max(int(circle.u - r), 0), min(int(circle.u + r) + 2, W)
@@ -67,40 +82,55 @@ def contact_samples(press: Press, circle: Circle, folder: PressFolder, share: fl
     d = np.stack([u - circle.u, v - circle.v], axis=-1)  # (h, w, 2)
     R = max(ball_radius_px(press, folder), circle.radius / _NOT_STEEPER)
     rho2 = np.sum(d * d, axis=-1)
-    seen = (rho2 < r * r) & ~press.dots[v0:v1, u0:u1]
+    seen = np.flatnonzero((rho2 < r * r) & ~press.dots[v0:v1, u0:u1])
+    seen = seen[:: len(seen) // most + 1]
     slopes = (
         d / np.sqrt(np.maximum(R * R - rho2, 1.0))[..., None]
     )  # ∂z/∂x = x/√(R² − ρ²): deeper in the middle
     return PressSamples(
-        slopes=slopes[seen],
-        unit_uv=np.stack([u / W, v / H], axis=-1)[seen],
-        colours=press.image[v0:v1, u0:u1][seen].astype(np.float64),
-        background=folder.background[v0:v1, u0:u1][seen].astype(np.float64),
+        slopes=slopes.reshape(-1, 2)[seen],
+        unit_uv=np.stack([u / W, v / H], axis=-1).reshape(-1, 2)[seen],
+        colours=press.image[v0:v1, u0:u1].reshape(-1, 3)[seen].astype(np.float64),
+        background=folder.background[v0:v1, u0:u1].reshape(-1, 3)[seen].astype(np.float64),
     )
 
 
-def _fit(folder: PressFolder, circles: list[Circle], shares: list[float], place_degree: int) -> Shading:
+def _fit(folder: PressFolder, circles: list[Circle], share: float, place_degree: int) -> Shading:
     parts = [
-        contact_samples(press, circle, folder, share)
-        for press, circle, share in zip(folder.presses, circles, shares, strict=True)
+        contact_samples(press, circle, folder, share, _FIT_PIXELS)
+        for press, circle in zip(folder.presses, circles, strict=True)
     ]
     stacked = [np.concatenate([getattr(p, name) for p in parts]) for name in PressSamples.__slots__]
-    thin = max(len(stacked[0]) // 60_000, 1)
-    return fit_shading(*(s[::thin] for s in stacked), place_degree=place_degree)
+    return fit_shading(*stacked, place_degree=place_degree)
 
 
 def _from_colour_change(press: Press, folder: PressFolder) -> Circle:
-    """First guess: the blob of changed colour; the contact is its inner part."""
+    """First guess. Flat gel in the middle of the blob of changed colour: the centre; where the colour changes
+    most, gel is steepest: the contact's edge."""
     change = smooth_fill(press.image.astype(np.float32) - folder.background, press.dots)
     scale = folder.reference.shape[1] / 320.0
-    size = np.linalg.norm(cv2.GaussianBlur(change, (0, 0), 2.0 * scale), axis=2)
-    blob = (size > max(0.25 * float(size.max()), 4.0)).astype(np.uint8)
-    count, _, stats, centroids = cv2.connectedComponentsWithStats(blob)
-    if count < 2:
-        raise CalibrationError(f"{press.name}: shows no press; remove it from presses.csv or give its circle")
-    best = 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))
-    radius = 0.6 * float(np.sqrt(stats[best, cv2.CC_STAT_AREA] / np.pi))
-    return Circle(float(centroids[best, 0]), float(centroids[best, 1]), max(radius, 3.0 * scale))
+    size = np.linalg.norm(cv2.GaussianBlur(change, (0, 0), 1.5 * scale), axis=2)
+    blob = (size > max(0.3 * float(size.max()), 4.0)).astype(np.uint8)
+    k = 2 * round(8 * scale) + 1
+    blob = cv2.morphologyEx(blob, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (k, k)))
+    outlines, _ = cv2.findContours(blob, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    if not outlines:
+        raise CalibrationError(f"{press.name}: shows no press; remove it from presses.csv")
+    (cu, cv), outer = cv2.minEnclosingCircle(max(outlines, key=cv2.contourArea))
+    v, u = np.indices(size.shape)
+    rho = np.hypot(u - cu, v - cv)
+    calm = np.where(rho < 0.6 * outer, size + 0.2 * float(size.max()) * (rho / outer) ** 2, np.inf)
+    centre_v, centre_u = (float(x) for x in np.unravel_index(int(np.argmin(calm)), size.shape))
+    return Circle(centre_u, centre_v, max(_steepest(size, centre_u, centre_v, 1.5 * outer), 3.0 * scale))
+
+
+def _steepest(size: FloatArray, cu: float, cv: float, limit: float) -> float:
+    """Radius (px) around a centre at which the mean colour change is largest."""
+    v, u = np.indices(size.shape)
+    ring = np.hypot(u - cu, v - cv).astype(np.intp)
+    near = ring < max(limit, 4)
+    profile = np.bincount(ring[near], weights=size[near]) / np.maximum(np.bincount(ring[near]), 1)
+    return float(np.argmax(profile)) + 0.5
 
 
 def _refine(press: Press, circle: Circle, shading: Shading, folder: PressFolder, limit: float) -> Circle:
@@ -132,7 +162,7 @@ def _residual(
     shift: tuple[float, float] = (0.0, 0.0),
 ) -> FloatArray:
     """Predicted minus seen colours (3n,) over a disc that stays put while the ball's centre shifts."""
-    s = contact_samples(press, circle, folder, share)
+    s = contact_samples(press, circle, folder, share, _FIT_PIXELS)
     R = ball_radius_px(press, folder)
     sine = s.slopes / np.sqrt(1.0 + np.sum(s.slopes**2, axis=1, keepdims=True)) - np.asarray(shift) / R
     slopes = sine / np.sqrt(np.maximum(1.0 - np.sum(sine**2, axis=1, keepdims=True), 1e-2))
@@ -143,9 +173,9 @@ def _residual(
 def _contact_radius(
     press: Press, circle: Circle, shading: Shading, folder: PressFolder, limit: float
 ) -> float:
-    """Largest radius up to which the ball's colours fit; it grows by at most a quarter per round."""
+    """Largest radius up to which the ball's colours fit."""
     wide = Circle(circle.u, circle.v, min(1.25 * circle.radius, limit))
-    s = contact_samples(press, wide, folder, 1.0)
+    s = contact_samples(press, wide, folder, 1.0, 3 * _FIT_PIXELS)
     if len(s.slopes) < 30:
         return circle.radius
     predicted = s.background * (1.0 + shading.ratio_change(s.slopes, s.unit_uv))
@@ -155,7 +185,7 @@ def _contact_radius(
     bins = np.linspace(0.0, wide.radius, 16)
     which = np.digitize(rho, bins) - 1
     profile = np.array([np.median(misfit[which == k]) if (which == k).any() else 0.0 for k in range(15)])
-    middle = float(np.median(profile[:8]))
-    bad = np.flatnonzero(profile > _MISFIT * max(middle, 0.5))
-    bad = bad[bad >= 6]
-    return float(bins[bad[0]]) if bad.size else wide.radius
+    usual = max(float(np.median(profile[:8])), float(np.linalg.norm(shading.sigma)))
+    bad = np.flatnonzero(profile > _MISFIT * usual)
+    bad = bad[bad >= 8]
+    return max(float(bins[bad[0]]), 0.6 * limit) if bad.size else wide.radius

@@ -17,7 +17,9 @@ from tiptrace.types import BoolArray, Image
 
 Float32Map = NDArray[np.float32]
 
-_RIM_PX = 2  # a dot's blurred rim is brighter than the marker range, yet no gel: its slopes are not the surface's
+_RIM_PX = (
+    2  # a dot's blurred rim is brighter than the marker range, yet no gel: its slopes are not the surface's
+)
 _FLAT = 0.03  # change of slope below which gel counts as flat, m/m
 _SHALLOW = 0.25  # of the depth range: flat gel above this level is touched
 _SHALLOW_M = 60e-6  # … but never closer to the lowest gel than its noise
