@@ -85,7 +85,7 @@ def test_friction_makes_the_tip_trail(t3: tuple[TrialPhysics, list[FrameState]])
 
 
 def test_a_closed_loop_creates_no_energy() -> None:
-    """The hand moves in a small circle with the tip stuck in the pit: the work it does is what friction takes."""
+    """The hand moves in a closed loop with the tip in the pit: its work, less what is stored, is friction's."""
     physics = TrialPhysics(short_spec(), np.zeros(3))
     physics.grasp = type(physics.grasp)(
         physics.grasp.pads.__class__(
@@ -113,14 +113,14 @@ def test_a_closed_loop_creates_no_energy() -> None:
                 work += float(0.5 * (force + last[0]) @ (T[:3, 3] - last[1]))
             last = (force, T[:3, 3])
             stored.append(e.pads.stored_j + e.tip.stored_j)
-        return work, float(np.ptp(stored))
+        return work - (stored[-1] - stored[0]), float(np.ptp(stored))
 
     loop(0.3e-3, 40)  # settle the outermost springs
     small, scale = loop(0.3e-3, 60)
-    assert abs(small) < 0.03 * scale  # nothing but the springs at the patch's rim slips
-    assert small > -1e-3 * scale
+    assert abs(small) < 2e-3 * scale  # nothing but the springs at the patch's rim slips
+    assert small > -1e-4 * scale
     large, _ = loop(2e-3, 120)
-    assert large > 0.0  # springs slip, the tip slides: the loop takes energy
+    assert large > 10 * abs(small)  # springs slip, the tip slides: the loop takes energy
 
 
 def test_mirrored_groove_gives_the_mirrored_trial() -> None:

@@ -89,7 +89,6 @@ class Disturbances(_Model):
 LEVELS: dict[LevelName, Disturbances] = {
     "clean": Disturbances(
         markers=MarkerNoise(in_plane_m=0.02e-3, depth_m=0.05e-3),
-        nominal_tip_m=3e-3,
         latency_known=True,
     ),
     "nominal": Disturbances(

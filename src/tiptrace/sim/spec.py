@@ -118,7 +118,7 @@ class TrialSpec(_Model):
     travel_m: NotNegative = 0.2
     speed_mps: Annotated[float, Field(gt=0, le=0.25)] = 0.02
     ramp_s: NotNegative = 0.4
-    preload_n: Annotated[float, Field(ge=0, le=15)] = 3.8
+    preload_n: Annotated[float, Field(ge=0, le=15)] = 3.6
     anchor_force_n: Annotated[float, Field(gt=0, le=15)] = 4.5
     indentation_m: Annotated[float, Field(gt=0, lt=3e-3)] = 1.2e-3
     marker_grid: tuple[Annotated[int, Field(ge=2, le=40)], Annotated[int, Field(ge=2, le=40)]] = (7, 9)
