@@ -22,6 +22,8 @@ MAY_IMPORT = {
     "outputs": BASE | {"geometry", "evaluation"},
     "tracer": BASE | {"geometry", "perception", "estimation"},
     "pipeline": BASE | {"geometry", "streams", "tracer"},
+    "trial_runs": BASE | {"estimation", "evaluation", "pipeline", "reconstruction", "sim", "streams", "tracer"},
+    "trial_plan": BASE | {"evaluation", "sim", "trial_runs"},
     "reconstruction": BASE | {"estimation", "evaluation", "geometry", "outputs", "pipeline", "streams", "tracer"},
 }
 
