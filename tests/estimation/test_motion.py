@@ -38,7 +38,7 @@ def test_exact_motion_comes_back() -> None:
 
 def test_covariance_tells_the_scatter() -> None:
     M, pad = template()
-    config = MotionConfig(depth_bias_sigma_m=0.0)
+    config = MotionConfig(depth_sigma_m=1e-4, depth_bias_sigma_m=0.0)
     fit = TemplateFit(M, pad, AXES, np.ones(len(M)), config)
     rng = np.random.default_rng(0)
     T = 3000

@@ -13,9 +13,9 @@ import numpy as np
 from tiptrace.config import Tool
 from tiptrace.errors import GeometryError
 from tiptrace.estimation.anchor import TipPrior
-from tiptrace.estimation.full import require_tip
 from tiptrace.estimation.pads import PadMarkers
 from tiptrace.estimation.patch import PatchConfig, in_contact
+from tiptrace.estimation.priors import require_tip
 from tiptrace.geometry.kabsch import kabsch
 from tiptrace.geometry.transforms import apply, invert
 from tiptrace.types import Anchor, Event, FloatArray, Phase, SensedPair, Status, TipEstimate

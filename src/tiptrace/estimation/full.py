@@ -8,21 +8,32 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from tiptrace.config import Rig, Tool
-from tiptrace.errors import GeometryError
 from tiptrace.estimation.anchor import TipPrior
+from tiptrace.estimation.event_log import EventLog
+from tiptrace.estimation.integrity import Findings, IntegrityConfig, Monitor
 from tiptrace.estimation.motion import MotionConfig, Motions, TemplateFit
 from tiptrace.estimation.observability import advice, weak_axes
 from tiptrace.estimation.pads import PadMarkers
 from tiptrace.estimation.patch import PatchConfig
+from tiptrace.estimation.phases import PhaseConfig, PhaseDetector
 from tiptrace.estimation.pose_track import HandStates, PoseTrack
+from tiptrace.estimation.priors import calibrated_latency, require_tip, tip_prior
 from tiptrace.estimation.propagation import Tip, propagate
+from tiptrace.estimation.reanchor import ReanchorConfig, Reanchoring
 from tiptrace.estimation.stage_one import Anchoring, RunningTip, StageOne, StageOneConfig
 from tiptrace.estimation.tip_map import P, TipMapConfig
+from tiptrace.estimation.verdict import Verdict
 from tiptrace.types import Anchor, Event, FloatArray, Phase, PoseSample, SensedPair, Status, TipEstimate
+
+_TEMPLATE_FRAMES = 5
+_TOO_FEW = "fewer markers than a rigid motion needs, or none on one pad"
 
 
 class FullConfig(BaseModel):
-    """Settings of the full estimator; the defaults were chosen on simulated trials with seeds below 1000."""
+    """Settings of the full estimator; the defaults were chosen on simulated trials with seeds below 1000.
+
+    ``use_stage_one = False`` takes the tip from the tool's file (``--tip``).
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -30,37 +41,64 @@ class FullConfig(BaseModel):
     motion: MotionConfig = MotionConfig()
     tip_map: TipMapConfig = TipMapConfig()
     stage_one: StageOneConfig = StageOneConfig()
+    integrity: IntegrityConfig = IntegrityConfig()
+    phases: PhaseConfig = PhaseConfig()
+    reanchor: ReanchorConfig = ReanchorConfig()
+    use_stage_one: bool = True
     use_tip_prior: bool = True
     refuse_sigma_m: float = Field(default=2e-3, gt=0)
+    slip_sigma_m: float = Field(default=1.5e-3, gt=0)
     pose_half_width_s: float = Field(default=0.05, gt=0)
     pose_memory_s: float = Field(default=1.0, gt=0.2)
     tip_noise_m: float = Field(default=1e-4, gt=0)  # hand pose and model at the tip, per frame
+    unknown_tip_m: tuple[float, float] = (0.06, 0.03)  # beyond the pads along z_E, and σ, for displacements
 
 
 class FullEstimator:
     """Marker pairs in, tip with covariance out. One pass, constant cost and memory."""
 
     def __init__(
-        self, config: FullConfig | None = None, rig: Rig | None = None, tool: Tool | None = None
+        self,
+        config: FullConfig | None = None,
+        rig: Rig | None = None,
+        tool: Tool | None = None,
+        anchor_from: TipPrior | Anchoring | None = None,
     ) -> None:
-        self._config = config or FullConfig()
-        c = self._config
+        """Set up.
+
+        Args:
+            config: Settings.
+            rig: For the calibrated latency.
+            tool: For the tip's prior, and for the tip itself where there is no Stage I.
+            anchor_from: Replaces Stage I (``--anchor-from``). In the same grasp the other trial's
+                :attr:`anchoring`, whose marker template carries over; after a regrasp its :attr:`tip_E`, inflated.
+        """
+        self._config = c = config or FullConfig()
         self._latency = calibrated_latency(rig)
         self._prior = tip_prior(tool) if c.use_tip_prior else None
+        self._given: TipPrior | Anchoring | None = (
+            anchor_from if anchor_from is not None else (None if c.use_stage_one else require_tip(tool))
+        )
         self._track = PoseTrack(c.pose_memory_s, c.pose_half_width_s)
         self._stage_one = StageOne(c.stage_one, c.patch, c.motion, c.tip_map, c.pose_half_width_s)
         self._running = RunningTip(self._prior, c.tip_noise_m, c.tip_map.map_sigma)
-        self._running_fit: TemplateFit | None = None
+        self._phases = PhaseDetector(c.phases)
+        self._monitor = Monitor(c.integrity)
+        self._reanchoring = Reanchoring(c.reanchor, self._stage_one)
+        self._fit_I: TemplateFit | None = None
         self._last_motion: tuple[FloatArray, FloatArray] | None = None
         self._anchoring: Anchoring | None = None
         self._anchor: Anchor | None = None
-        self._refused = False
+        self._refused = self._relative = False
+        self._first: Tip | None = None  # first contact, for displacements
         self._rate = _Rate()
         self.events: list[Event] = []
+        self._log = EventLog(self.events)
+        self._verdict = Verdict(self._log, c.slip_sigma_m)
 
     @property
     def anchor(self) -> Anchor | None:
-        """Stage I result; None before it is solved and where it was refused."""
+        """Stage I result; None before it is solved, where it was refused, and for displacements."""
         return self._anchor
 
     @property
@@ -68,88 +106,128 @@ class FullEstimator:
         """Everything that Stage I left, refused or not."""
         return self._anchoring
 
-    def update(self, pair: SensedPair) -> TipEstimate:
-        """Process the next pair.
+    @property
+    def tip_E(self) -> TipPrior | None:
+        """The tip in F_E for another trial with the same grasp (``--anchor-from``); None without an anchor."""
+        if self._anchoring is None or self._anchor is None:
+            return None
+        tip_map = self._anchoring.tip_map
+        return TipPrior(tip_map.c, tip_map.covariance[:3, :3])
 
-        Raises:
-            GeometryError: reconstruction begins without a usable Stage I.
-        """
+    def update(self, pair: SensedPair) -> TipEstimate:
+        """Process the next pair."""
         markers = PadMarkers.of(pair)
         poses = pair.poses or (PoseSample(pair.stamp_ns, pair.left.T_B_E),)
         self._track.extend(poses)
-        if pair.phase is Phase.ANCHORING:
-            self._stage_one.add_poses(poses)
-            return self._stage_one_step(pair, markers)
-        if self._anchoring is None:
-            self._finish_stage_one(pair)
-        return self._stage_two_step(pair, markers)
+        repeated = self._monitor.repeated(markers.x_S, markers.pad)
+        phase = pair.phase or self._phases.update(pair.stamp_ns, pair.left.T_B_E)
+        if phase is Phase.ANCHORING and self._given is None:
+            return self._stage_one_step(replace(pair, phase=phase, poses=poses), markers)
+        if self._anchoring is None and not self._begin_stage_two(pair, poses, markers):
+            return TipEstimate(self._exposure_ns(pair.stamp_ns), phase, Status.LOST)
+        return self._stage_two_step(replace(pair, phase=phase, poses=poses), markers, repeated)
 
     # --- Stage I --------------------------------------------------------------------------------------------
 
     def _stage_one_step(self, pair: SensedPair, markers: PadMarkers) -> TipEstimate:
+        self._stage_one.add_poses(pair.poses)
         self._stage_one.add(pair.stamp_ns, markers)
         n = len(self._stage_one)
-        if n in (1, 2, 5):
-            self._running_fit = self._stage_one.first_fit()
-            self._last_motion = None
-        assert self._running_fit is not None
-        motions = self._fit(self._running_fit, markers)
+        if n in (1, 2, _TEMPLATE_FRAMES):
+            self._fit_I, self._last_motion = self._stage_one.first_fit(), None
+        assert self._fit_I is not None
+        motions = self._fit(self._fit_I, markers)
         stamp_ns = self._exposure_ns(pair.stamp_ns)
-        estimate = TipEstimate(
-            stamp_ns, pair.phase, Status.ANCHORING, markers=int((motions.weights > 0).sum())
-        )
+        used = int((motions.weights > 0).sum())
+        estimate = TipEstimate(stamp_ns, pair.phase, Status.ANCHORING, markers=used)
         hand = self._hand(stamp_ns)
-        if hand is None or not self._usable(motions):
-            return estimate
-        if n < 5:  # before the running template stands
+        if hand is None or not self._usable(motions) or n < _TEMPLATE_FRAMES:
             return estimate
         T_B_E = hand.T_B_E[0]
         self._running.add(motions, T_B_E)
-        estimate = replace(
-            estimate, R_B_E=T_B_E[:3, :3] @ motions.R[0], residual_m=float(motions.residual_m[0])
-        )
+        residual = float(motions.residual_m[0])
+        estimate = replace(estimate, R_B_E=T_B_E[:3, :3] @ motions.R[0], residual_m=residual)
         solution = self._running.solve()
         if solution is None or weak_axes(solution[1], self._config.refuse_sigma_m):
             return estimate
         return replace(estimate, p_B=solution[0], covariance=solution[1])
 
-    def _finish_stage_one(self, pair: SensedPair) -> None:
-        """Solve Stage I and accept or refuse the anchor."""
-        self._anchoring = self._stage_one.solve(self._latency, self._prior)
+    def _begin_stage_two(self, pair: SensedPair, poses: tuple[PoseSample, ...], markers: PadMarkers) -> bool:
+        """Solve Stage I, or stand in for it; False while there are too few frames for a template."""
         self._last_motion = None
-        tip_map, limit = self._anchoring.tip_map, self._config.refuse_sigma_m
+        if len(self._stage_one) >= _TEMPLATE_FRAMES and self._given is None:
+            if self._phases.end_ns is not None:
+                self._stage_one.keep_until(self._phases.end_ns)
+            self._accept(self._stage_one.solve(self._latency, self._prior), pair.stamp_ns)
+            return True
+        self._stage_one.add_poses(poses)
+        self._stage_one.add(pair.stamp_ns, markers)
+        if len(self._stage_one) < _TEMPLATE_FRAMES or self._hand(self._exposure_ns(pair.stamp_ns)) is None:
+            return False
+        tip = self._given
+        if isinstance(tip, Anchoring):
+            self._anchoring = tip.carried_over(pair.stamp_ns)
+            return True
+        if tip is None:
+            self._relative = True
+            away, sigma = self._config.unknown_tip_m
+            tip = TipPrior(
+                self._stage_one.centre_E + [0.0, 0.0, away], np.diag([0.5 * sigma, 0.5 * sigma, sigma]) ** 2
+            )
+        self._anchoring = self._stage_one.assume(tip, self._latency)
+        return True
+
+    def _accept(self, anchoring: Anchoring, stamp_ns: int) -> None:
+        """Take the anchor, or refuse it and say which motion is missing."""
+        self._anchoring = anchoring
+        tip_map, limit = anchoring.tip_map, self._config.refuse_sigma_m
         covariance = tip_map.covariance[P, P]
         weak = weak_axes(covariance, limit)
         if weak:
             self._refused = True
-            R = self._anchoring.tool_rotations
-            self._note("anchor-refused", pair.stamp_ns, advice(weak, covariance, R, limit))
+            self._log.note(
+                "anchor-refused",
+                stamp_ns,
+                stamp_ns,
+                advice(weak, covariance, anchoring.tool_rotations, limit),
+            )
             return
-        self._anchor = Anchor(tip_map.p, covariance, tip_map.residual_m, tip_map.frames, weak)
+        self._anchor = Anchor(tip_map.p, covariance, tip_map.residual_m, tip_map.frames)
 
     # --- Stage II -------------------------------------------------------------------------------------------
 
-    def _stage_two_step(self, pair: SensedPair, markers: PadMarkers) -> TipEstimate:
+    def _stage_two_step(
+        self, pair: SensedPair, markers: PadMarkers, repeated: tuple[bool, bool]
+    ) -> TipEstimate:
         assert self._anchoring is not None
         stamp_ns = self._exposure_ns(pair.stamp_ns)
         motions = self._fit(self._anchoring.fit, markers)
-        used = int((motions.weights > 0).sum())
+        estimate = TipEstimate(stamp_ns, pair.phase, Status.LOST, markers=int((motions.weights > 0).sum()))
         if self._refused:
-            return TipEstimate(stamp_ns, pair.phase, Status.UNOBSERVABLE, markers=used)
+            return replace(estimate, status=Status.UNOBSERVABLE)
         hand = self._hand(stamp_ns)
-        if hand is None or not self._usable(motions):
-            return TipEstimate(stamp_ns, pair.phase, Status.LOST, markers=used)
+        if hand is None:
+            self._log.note("pose-gap", stamp_ns, stamp_ns, "no end-effector poses about this instant")
+            return estimate
+        if not self._usable(motions):
+            self._log.note(
+                "too-few-markers",
+                stamp_ns,
+                stamp_ns,
+                "fewer markers than a rigid motion needs, or none on one pad",
+            )
+            return estimate
         tip = self._propagate(pair.stamp_ns, motions, hand)
-        return TipEstimate(
-            stamp_ns,
-            pair.phase,
-            Status.OK,
-            p_B=tip.p_B,
-            R_B_E=hand.T_B_E[0, :3, :3] @ motions.R[0],
-            covariance=tip.covariance,
-            residual_m=float(motions.residual_m[0]),
-            markers=used,
-        )
+        status, extra = self._verdict.of(stamp_ns, self._judge(markers, motions, repeated))
+        R_B_E = hand.T_B_E[0, :3, :3] @ motions.R[0]
+        estimate = replace(estimate, status=status, R_B_E=R_B_E, residual_m=float(motions.residual_m[0]))
+        self._try_reanchoring(pair, markers, tip.p_B, R_B_E)
+        if status is Status.NO_CONTACT:
+            return estimate
+        if self._relative:
+            return self._displacement(estimate, tip, extra)
+        self._set_anchor_from_given(tip)
+        return replace(estimate, p_B=tip.p_B, covariance=tip.covariance + extra)
 
     def _propagate(self, stamp_ns: int, motions: Motions, hand: HandStates) -> Tip:
         assert self._anchoring is not None
@@ -161,6 +239,45 @@ class FullEstimator:
         late = a.tip_map.covariance[15, 15] * np.outer(v, v)
         return replace(tip, covariance=tip.covariance + late)
 
+    def _judge(self, markers: PadMarkers, motions: Motions, repeated: tuple[bool, bool]) -> Findings:
+        assert self._anchoring is not None
+        a = self._anchoring
+        residual = a.fit.residual(markers.X, motions)
+        return self._monitor.judge(
+            a.reference, motions, a.tip_map.c, residual, a.fit.twist(residual), repeated
+        )
+
+    def _displacement(self, estimate: TipEstimate, tip: Tip, extra: FloatArray) -> TipEstimate:
+        """Displacement from the first contact; what both ends share of the unknown tip cancels."""
+        assert self._anchoring is not None
+        if self._first is None:
+            self._first = tip
+        J = tip.jacobian - self._first.jacobian
+        covariance = J @ self._anchoring.tip_map.covariance @ J.T + tip.own + self._first.own + extra
+        moved = tip.p_B - self._first.p_B
+        return replace(estimate, status=Status.RELATIVE, p_B=moved, covariance=covariance)
+
+    def _set_anchor_from_given(self, tip: Tip) -> None:
+        """With a tip from elsewhere the anchor is the first contact."""
+        if self._anchor is None:
+            self._anchor = Anchor(tip.p_B, tip.covariance, 0.0, 0)
+
+    def _try_reanchoring(
+        self, pair: SensedPair, markers: PadMarkers, p_B: FloatArray, R_B_E: FloatArray
+    ) -> None:
+        """After a slip: when the tip rests again while the hand turns, anchor anew."""
+        assert self._anchoring is not None
+        if not self._verdict.slipped or self._relative:
+            return
+        renewed = self._reanchoring.update(pair, markers, p_B, R_B_E, self._anchoring.tip_map)
+        if renewed is None or weak_axes(renewed.tip_map.covariance[P, P], self._config.refuse_sigma_m):
+            return
+        self._anchoring, self._last_motion = renewed, None
+        self._verdict.slipped = False
+        sigma = np.sqrt(np.linalg.eigvalsh(renewed.tip_map.covariance[P, P])[-1]) * 1e3
+        detail = f"the tip rested while the hand turned: anchored anew, to {sigma:.1f} mm"
+        self._log.note("re-anchored", pair.stamp_ns, pair.stamp_ns, detail)
+
     # --- shared ---------------------------------------------------------------------------------------------
 
     def _fit(self, fit: TemplateFit, markers: PadMarkers) -> Motions:
@@ -170,8 +287,8 @@ class FullEstimator:
 
     def _usable(self, motions: Motions) -> bool:
         """Enough markers, on both pads."""
-        used = motions.weights[0] > 0
-        return bool(used.sum() >= self._config.motion.min_markers and motions.sides[0].min() > 0)
+        used = np.count_nonzero(motions.weights[0])
+        return bool(used >= self._config.motion.min_markers and motions.sides[0].min() > 0)
 
     def _exposure_ns(self, stamp_ns: int) -> int:
         if self._anchoring is not None:
@@ -180,10 +297,10 @@ class FullEstimator:
         return stamp_ns - round(mean_s * 1e9)
 
     def _hand(self, stamp_ns: int) -> HandStates | None:
-        return self._track.at([stamp_ns]) if self._track.covers(stamp_ns) else None
-
-    def _note(self, kind: str, stamp_ns: int, detail: str) -> None:
-        self.events.append(Event(kind, stamp_ns, stamp_ns, detail))
+        known = (
+            self._track.covers(stamp_ns) and self._track.gap_s(stamp_ns) <= self._config.integrity.pose_gap_s
+        )
+        return self._track.at([stamp_ns]) if known else None
 
 
 class _Rate:
@@ -200,33 +317,3 @@ class _Rate:
             self._v = keep * self._v + (1.0 - keep) * (x - self._last[1]) / dt
         self._last = (stamp_ns, x)
         return self._v
-
-
-def calibrated_latency(rig: Rig | None) -> tuple[float, float] | None:
-    """Mean and standard deviation of capture minus exposure in s, where the rig states it for both sensors."""
-    if rig is None:
-        return None
-    sensors = (rig.sensors.left, rig.sensors.right)
-    known = [(s.latency_s, s.latency_std_s or 0.005) for s in sensors if s.latency_s is not None]
-    if len(known) < 2:
-        return None
-    return float(np.mean([m for m, _ in known])), float(max(s for _, s in known))
-
-
-def tip_prior(tool: Tool | None) -> TipPrior | None:
-    """Tip and covariance from the tool's file, where it states both."""
-    if tool is None or tool.tip_E_m is None or tool.tip_sigma_m is None:
-        return None
-    return TipPrior(np.array(tool.tip_E_m), np.diag(np.square(tool.tip_sigma_m)))
-
-
-def require_tip(tool: Tool | None) -> TipPrior:
-    """The tool's tip, or an error that says what to write.
-
-    Raises:
-        GeometryError: the tool's file states no tip.
-    """
-    prior = tip_prior(tool)
-    if prior is None:
-        raise GeometryError("the tool's file states no tip: add tip_E_m and tip_sigma_m to tool.yaml")
-    return prior

@@ -84,7 +84,9 @@ class TemplateFit:
         self._all = M
         self._active = np.flatnonzero(np.isfinite(M).all(axis=1) & (trust > 0))  # rows in use
         self._M, self._trust, self._pad = M[self._active], trust[self._active], pad[self._active].astype(int)
-        self._g = np.average(self._M, axis=0, weights=self._trust) if len(self._M) else np.zeros(3)  # centroid
+        self._g = (
+            np.average(self._M, axis=0, weights=self._trust) if len(self._M) else np.zeros(3)
+        )  # centroid
         self._basis = axes[self._pad]  # (N, 3, 3): columns u, v, n
         self._sigma = np.array(
             [config.in_plane_sigma_m] * 2 + [np.hypot(config.depth_sigma_m, config.depth_bias_sigma_m)]
@@ -182,6 +184,35 @@ class TemplateFit:
         full = np.zeros((len(values), len(self._all)))
         full[:, self._active] = values
         return full
+
+    def residual(self, X: FloatArray, motions: Motions, k: int = 0) -> FloatArray:
+        """In-plane residual of frame k in F_E, (N, 3) m; NaN where lost or not in use.
+
+        Args:
+            X: (N, 3) markers of the frame in F_E.
+            motions: Fitted motions.
+            k: Frame.
+        """
+        out = np.full((len(self._all), 3), np.nan)
+        r = X[self._active] - (self._M @ motions.R[k].T + motions.t[k])
+        normal = self._basis[:, :, 2]
+        out[self._active] = r - np.sum(r * normal, axis=1, keepdims=True) * normal
+        return out
+
+    def twist(self, residual_E: FloatArray) -> float:
+        """Rotation about the closing axis by which the left pad's markers lead the right's, rad."""
+        turn = [0.0, 0.0]
+        normal = self._basis[0, :, 2] if len(self._M) else np.zeros(3)  # one axis for both pads
+        r_all = residual_E[self._active]
+        for k in (0, 1):
+            here = (self._pad == k) & np.isfinite(r_all[:, 0])
+            if here.sum() < 3:
+                continue
+            x = self._M[here] - self._M[here].mean(axis=0)
+            r = r_all[here] - r_all[here].mean(axis=0)
+            around = np.cross(normal, x)
+            turn[k] = float(np.sum(around * r) / np.maximum(np.sum(around * around), 1e-12))
+        return turn[0] - turn[1]
 
     def refined_template(self, X: FloatArray, motions: Motions) -> FloatArray:
         """Mean of the frames carried back to the template, (N, 3); markers never seen stay."""

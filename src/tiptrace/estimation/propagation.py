@@ -25,12 +25,16 @@ class Tip:
         covariance: (3, 3) m²: anchor, map, latency, motion and its nuisances.
         shown_E: (3,) D_t, the displacement in the grasp that the markers show, m.
         moved_E: (3,) G⁻¹ D_t, what the tool really did, m.
+        jacobian: (3, 19) of p_B with respect to the unknowns of the tip map.
+        own: (3, 3) m², the part of the covariance that is this frame's alone.
     """
 
     p_B: FloatArray
     covariance: FloatArray
     shown_E: FloatArray
     moved_E: FloatArray
+    jacobian: FloatArray
+    own: FloatArray
 
 
 def propagate(
@@ -63,5 +67,5 @@ def propagate(
     # caller adds from its rate.
     B = np.concatenate([-skew(R @ c_t + t - motions.centre[k]), np.eye(3)], axis=1)  # (3, 6)
     L = R_BE @ G_inv @ B
-    covariance = J @ tip_map.covariance @ J.T + L @ motions.covariance[k] @ L.T + noise_m**2 * np.eye(3)
-    return Tip(p_B, covariance, D, moved)
+    own = L @ motions.covariance[k] @ L.T + noise_m**2 * np.eye(3)
+    return Tip(p_B, J @ tip_map.covariance @ J.T + own, D, moved, J, own)

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from tiptrace.errors import GeometryError
 from tiptrace.estimation.anchor import TipPrior, covariance_from_information
+from tiptrace.estimation.integrity import Reference, reference
 from tiptrace.estimation.motion import MotionConfig, Motions, TemplateFit
 from tiptrace.estimation.pads import PadMarkers
 from tiptrace.estimation.patch import PatchConfig, trust
 from tiptrace.estimation.pose_track import HandStates, smooth_at
-from tiptrace.estimation.tip_map import TipMap, TipMapConfig, solve_tip_map
+from tiptrace.estimation.tip_map import DRIFT, C, TipMap, TipMapConfig, assumed_tip_map, solve_tip_map
 from tiptrace.geometry.transforms import skew
 from tiptrace.types import BoolArray, FloatArray, PoseSample
 
@@ -39,13 +40,25 @@ class Anchoring:
     trust: FloatArray
     stamps_ns: FloatArray
     motions: Motions
-    hand: HandStates
+    hand: HandStates | None
+    reference: Reference
     start_ns: int
 
     @property
     def tool_rotations(self) -> FloatArray:
         """(T, 3, 3) rotations of the tool in F_B."""
+        if self.hand is None:
+            return self.motions.R
         return np.asarray(self.hand.T_B_E[:, :3, :3] @ self.motions.R)
+
+    def carried_over(self, stamp_ns: int, sigma_m: float = 2e-4) -> Anchoring:
+        """The same grasp in a later trial: no more drift, a little less certain."""
+        theta, covariance = self.tip_map.theta.copy(), self.tip_map.covariance.copy()
+        theta[DRIFT] = 0.0
+        covariance[C, C] += sigma_m**2 * np.eye(3)
+        return replace(
+            self, tip_map=replace(self.tip_map, theta=theta, covariance=covariance), start_ns=stamp_ns
+        )
 
     def phase(self, stamp_ns: float) -> float:
         """t/T_I − 1."""
@@ -112,13 +125,13 @@ class StageOne:
         Raises:
             GeometryError: too few frames, markers or poses.
         """
-        stamps, fit, weights, motions = self._fit_template()
+        stamps, X, fit, weights, motions = self._fit_template()
         duration = max((stamps[-1] - stamps[0]) * 1e-9, 1e-3)
-        phase = (stamps - stamps[0]) * 1e-9 / duration - 1.0
         good: BoolArray = motions.sides[:, 0] * motions.sides[:, 1] > 0
         if good.sum() < 3:
             raise GeometryError("Stage I has fewer than 3 frames with markers on both fingers")
-        motions, kept = _select(motions, good), stamps[good]
+        motions, kept, X = _select(motions, good), stamps[good], X[good]
+        phase = (kept - stamps[0]) * 1e-9 / duration - 1.0
         track = np.array([p.stamp_ns for p in self._poses], dtype=np.float64)
         T = np.array([p.T_B_E for p in self._poses])
         if len(track) < 4:
@@ -127,11 +140,49 @@ class StageOne:
         def hand_at(latency_s: float) -> HandStates:
             return smooth_at(track, T, kept - latency_s * 1e9, self._half_s)
 
-        normal = self._frames[-1][1].axes[0, :, 2]
-        tip_map = solve_tip_map(motions, hand_at, phase[good], duration, self._tip_map, latency, prior, normal)
-        return Anchoring(tip_map, fit, weights, kept, motions, hand_at(tip_map.latency_s), int(stamps[0]))
+        tip_map = solve_tip_map(
+            motions, hand_at, phase, duration, self._tip_map, latency, prior, self._normal
+        )
+        ref = _reference(fit, X, motions, tip_map.c)
+        hand = hand_at(tip_map.latency_s)
+        return Anchoring(tip_map, fit, weights, kept, motions, hand, ref, int(stamps[0]))
 
-    def _fit_template(self) -> tuple[FloatArray, TemplateFit, FloatArray, Motions]:
+    def assume(self, tip: TipPrior, latency: tuple[float, float] | None) -> Anchoring:
+        """Stand-in for Stage I with a tip from elsewhere: the first frames only give the template."""
+        fit = self.first_fit()
+        X = np.stack([m.X for _, m in self._frames])
+        motions = fit.fit(X)
+        tip_map = assumed_tip_map(tip, self._tip_map, latency, self._normal)
+        stamps = np.array([s for s, _ in self._frames], dtype=np.float64)
+        ref = _reference(fit, X, motions, tip.c)
+        return Anchoring(tip_map, fit, self.trust(), stamps, motions, None, ref, int(stamps[0]))
+
+    @property
+    def centre_E(self) -> FloatArray:
+        """(3,) middle of the pads in F_E."""
+        return np.asarray(np.nanmean(self._frames[-1][1].X, axis=0))
+
+    @property
+    def _normal(self) -> FloatArray:
+        return self._frames[-1][1].axes[0, :, 2]
+
+    def fresh(self) -> StageOne:
+        """An empty segment with the same settings."""
+        return StageOne(self._config, self._patch, self._motion, self._tip_map, self._half_s)
+
+    def keep_from(self, stamp_ns: int) -> None:
+        """Forget frames and poses before an instant."""
+        while self._frames and self._frames[0][0] < stamp_ns:
+            self._frames.popleft()
+        while self._poses and self._poses[0].stamp_ns < stamp_ns - 500_000_000:
+            self._poses.popleft()
+
+    def keep_until(self, stamp_ns: int) -> None:
+        """Forget frames after an instant: the segment turned out to have ended there."""
+        while len(self._frames) > 3 and self._frames[-1][0] > stamp_ns:
+            self._frames.pop()
+
+    def _fit_template(self) -> tuple[FloatArray, FloatArray, TemplateFit, FloatArray, Motions]:
         """Template from all frames, alternating with the motions."""
         if len(self._frames) < 3:
             raise GeometryError(f"Stage I has {len(self._frames)} frames, at least 3 are needed")
@@ -146,7 +197,7 @@ class StageOne:
             motions = fit.fit(X, start)
             M, start = fit.refined_template(X, motions), (motions.R, motions.t)
         fit = TemplateFit(M, first.pad, first.axes, weights, self._motion)
-        return stamps, fit, weights, fit.fit(X, start)
+        return stamps, X, fit, weights, fit.fit(X, start)
 
 
 def _first_seen(X: FloatArray) -> FloatArray:
@@ -160,6 +211,11 @@ def _first_seen(X: FloatArray) -> FloatArray:
 
 def _select(m: Motions, good: BoolArray) -> Motions:
     return Motions(*(getattr(m, name)[good] for name in Motions.__slots__))
+
+
+def _reference(fit: TemplateFit, X: FloatArray, motions: Motions, c_E: FloatArray) -> Reference:
+    twists = np.array([fit.twist(fit.residual(x, motions, k)) for k, x in enumerate(X)])
+    return reference(motions, c_E, twists)
 
 
 class RunningTip:

@@ -137,18 +137,43 @@ def solve_tip_map(
     learned_column = solver.moved(theta) > config.map_gate_m
     free[G_] = (np.tile(learned_column, 3) | _DIAGONAL) & config.learn_map & bool(learned_column.any())
     best = solver.solve(theta, free)
+    if solver.map_is_absurd(best):
+        free[G_] = False
+        best = solver.solve(theta, free)
     if latency_too_vague(best, config):
         free[TAU] = False
         best = solver.solve(theta, free)
     drifting = free.copy()
     drifting[DRIFT] = True
     candidate = solver.solve(best.theta, drifting)
-    sigma = np.sqrt(np.diag(candidate.covariance)[DRIFT])
-    if np.any(np.abs(candidate.drift) > config.drift_evidence * sigma):
+    along = np.linalg.svd(normal[None])[2][1:]  # (2, 3) in the pads' plane: only there can a tool slip
+    sigma = np.sqrt(np.diag(along @ candidate.covariance[DRIFT, DRIFT] @ along.T))
+    if np.any(np.abs(along @ candidate.drift) > config.drift_evidence * sigma):
         best = candidate
     return TipMap(
         best.theta, best.covariance, best.learned, best.rms, best.factor, len(phase), duration_s, best.r
     )
+
+
+def assumed_tip_map(
+    tip: TipPrior, config: TipMapConfig, latency: tuple[float, float] | None, normal_E: FloatArray
+) -> TipMap:
+    """A tip taken from elsewhere, with everything else at its prior: there was no Stage I.
+
+    Args:
+        tip: Tip in F_E with its covariance.
+        config: Priors.
+        latency: Calibrated (mean, std) in s, where there is one.
+        normal_E: (3,) closing axis in F_E.
+    """
+    mean_s, std_s = latency or (config.latency_s, config.latency_std_s)
+    theta = np.concatenate([tip.c, np.zeros(3), _I9, [mean_s], np.zeros(3)])
+    covariance = np.zeros((_SIZE, _SIZE))
+    covariance[C, C] = tip.covariance
+    covariance[G_, G_] = _map_prior(config, normal_E)
+    covariance[TAU, TAU] = std_s**2
+    nothing = np.zeros(_SIZE, dtype=bool)
+    return TipMap(theta, covariance, nothing, 0.0, 1.0, 0, 1.0, np.zeros((0, 3)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,6 +237,11 @@ class _Solver:
         theta[C], theta[P] = point.c, point.p
         return theta
 
+    def map_is_absurd(self, solution: _Solution) -> bool:
+        """Whether the fit left its prior by more than four sigmas: the tip did not rest, or the map diverged."""
+        off = solution.theta[G_] - _I9
+        return bool(off @ np.linalg.solve(self._prior_P[G_, G_], off) > 4.0**2 + 9.0)
+
     def moved(self, theta: FloatArray) -> FloatArray:
         """Standard deviation of the enforced motion along each axis of F_E, (3,) m."""
         T = self._hand_at(float(theta[15])).T_B_E
@@ -242,7 +272,7 @@ class _Solver:
                 "tij,tj->ti", self._m.covariance, np.concatenate([np.cross(lever, k), k], axis=1)
             )
             theta = theta + step
-            if iteration > 4 and np.abs(step[:6]).max() < 1e-7:
+            if iteration > 4 and np.abs(step[:6]).max() < 1e-6:
                 break
         return self._finish(theta, free, delta, weights)
 

@@ -1,0 +1,173 @@
+"""Does the tool still sit in the grasp, does the tip still touch, are the frames new? (``docs/estimation.md``)
+
+Everything is judged against what the same trial showed in Stage I; nothing here changes an estimate, it only says
+what the frame is worth.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from tiptrace.estimation.motion import Motions
+from tiptrace.types import BoolArray, FloatArray
+
+
+class IntegrityConfig(BaseModel):
+    """Limits."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    frozen_m: float = Field(
+        default=2e-7, gt=0
+    )  # no marker of a finger moved by more: the image is the old one
+    stale_frames: int = Field(default=3, ge=2)
+    misfit_ratio: float = Field(
+        default=3.0, gt=1
+    )  # of the rigid fit's χ² to Stage I's: the tool slips in the grasp
+    misfit_floor: float = Field(default=0.7, gt=0)  # χ² of a clean fit is not taken for less
+    slip_frames: int = Field(default=2, ge=1)
+    jump_m: float = Field(
+        default=4e-4, gt=0
+    )  # of one marker between two frames, beyond the tool's own motion
+    twist_limit_rad: float = Field(default=0.02, gt=0)  # of one pad's markers against the other's
+    release_m: float = Field(
+        default=3.5e-4, gt=0
+    )  # the tool springs out along its axis when the tip lifts off
+    contact_frames: int = Field(default=2, ge=1)
+    pose_gap_s: float = Field(default=0.1, gt=0)
+
+
+@dataclass(frozen=True, slots=True)
+class Reference:
+    """What Stage I showed.
+
+    Attributes:
+        chi2: Median χ² of the rigid fit.
+        axis_E: (3,) from the pads to the tip.
+        axial_m: (2,) 5th and 95th percentile of the tool's displacement along it.
+        twist_rad: Median twist of the left pad's markers against the right's.
+        twist_spread_rad: Its spread (1.48 × median absolute deviation).
+    """
+
+    chi2: float
+    axis_E: FloatArray
+    axial_m: tuple[float, float]
+    twist_rad: float
+    twist_spread_rad: float
+
+
+def reference(motions: Motions, c_E: FloatArray, twists: FloatArray) -> Reference:
+    """From the motions of Stage I, the tip in F_E, and the pads' twists (T,)."""
+    axis = c_E - motions.centre.mean(axis=0)
+    axis = axis / np.linalg.norm(axis)
+    D = motions.R @ c_E + motions.t - c_E  # (T, 3)
+    low, high = np.percentile(D @ axis, [5, 95])
+    middle = float(np.median(twists))
+    spread = 1.48 * float(np.median(np.abs(twists - middle)))
+    return Reference(float(np.median(motions.chi2)), axis, (float(low), float(high)), middle, spread)
+
+
+@dataclass(frozen=True, slots=True)
+class Findings:
+    """What a frame shows.
+
+    Attributes:
+        repeated: Which fingers delivered an old frame (left, right).
+        frozen: The frames stand still for longer.
+        slipping: The markers no longer move as one body.
+        jumped: Rows of markers that jumped.
+        disagree: The pads twist against each other.
+        in_contact: Whether the tip touches.
+        axial_m: Displacement of the tool along its axis, out of the hand.
+    """
+
+    repeated: tuple[bool, bool]
+    frozen: bool
+    slipping: bool
+    jumped: BoolArray
+    disagree: bool
+    in_contact: bool
+    axial_m: float
+
+
+class Monitor:
+    """Judges frame after frame, in constant memory."""
+
+    def __init__(self, config: IntegrityConfig) -> None:
+        self._config = config
+        self._last_S: FloatArray | None = None
+        self._last_residual: FloatArray | None = None
+        self._same = np.zeros(2, dtype=int)
+        self._misfits = 0
+        self._away = 0
+        self._contact = True
+
+    def repeated(self, x_S: FloatArray, pad: FloatArray) -> tuple[bool, bool]:
+        """Whether each finger's frame equals the last one; call once per frame, first."""
+        same = [False, False]
+        if self._last_S is not None and self._last_S.shape == x_S.shape:
+            moved = np.abs(x_S - self._last_S).max(axis=1)  # (N,), NaN where lost
+            for k in (0, 1):
+                here = moved[(pad == k) & np.isfinite(moved)]
+                same[k] = len(here) > 0 and bool(here.max() < self._config.frozen_m)
+        self._last_S = x_S
+        self._same = np.where(same, self._same + 1, 0)
+        return same[0], same[1]
+
+    @property
+    def frozen(self) -> bool:
+        """Whether a finger has stood still for several frames."""
+        return bool(self._same.max() >= self._config.stale_frames)
+
+    def judge(
+        self,
+        ref: Reference,
+        motions: Motions,
+        c_E: FloatArray,
+        residual_E: FloatArray,
+        twist_rad: float,
+        repeated: tuple[bool, bool],
+    ) -> Findings:
+        """One frame of Stage II.
+
+        Args:
+            ref: Stage I.
+            motions: One frame.
+            c_E: Tip in F_E.
+            residual_E: (N, 3) markers less their fitted places, NaN where lost or unused.
+            twist_rad: Twist of the left pad's markers against the right's.
+            repeated: From :meth:`repeated`.
+        """
+        c = self._config
+        misfit = motions.chi2[0] > c.misfit_ratio * max(ref.chi2, c.misfit_floor)
+        self._misfits = self._misfits + 1 if misfit else 0
+        axial = float((motions.R[0] @ c_E + motions.t[0] - c_E) @ ref.axis_E)
+        self._judge_contact(axial, ref)
+        limit = max(c.twist_limit_rad, 6.0 * ref.twist_spread_rad)
+        return Findings(
+            repeated=repeated,
+            frozen=self.frozen,
+            slipping=self._misfits >= c.slip_frames,
+            jumped=self._jumped(residual_E),
+            disagree=abs(twist_rad - ref.twist_rad) > limit,
+            in_contact=self._contact,
+            axial_m=axial,
+        )
+
+    def _judge_contact(self, axial_m: float, ref: Reference) -> None:
+        """The preload holds the tool back; without contact it springs out by the preload over the stiffness."""
+        limit = ref.axial_m[1] + self._config.release_m * (1.0 if self._contact else 0.6)
+        away = axial_m > limit
+        self._away = self._away + 1 if away == self._contact else 0
+        if self._away >= self._config.contact_frames:
+            self._contact, self._away = not self._contact, 0
+
+    def _jumped(self, residual_E: FloatArray) -> BoolArray:
+        last, self._last_residual = self._last_residual, residual_E
+        if last is None or last.shape != residual_E.shape:
+            return np.zeros(len(residual_E), dtype=bool)
+        step = np.linalg.norm(residual_E - last, axis=1)
+        return np.asarray(np.where(np.isfinite(step), step, 0.0) > self._config.jump_m)
