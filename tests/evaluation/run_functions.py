@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -47,4 +48,10 @@ def run_or_fail(task: TrialTask, methods: Sequence[str]) -> TrialRun:
         if not marker.exists():
             marker.touch()
             os.kill(os.getpid(), signal.SIGKILL)
+    return run_straight(task, methods)
+
+
+def run_slowly(task: TrialTask, methods: Sequence[str]) -> TrialRun:
+    """Long enough for a worker to die in the middle."""
+    time.sleep(0.1)
     return run_straight(task, methods)

@@ -186,7 +186,9 @@ class SuiteRun:
         except BrokenExecutor:  # while handing out
             pass
         finally:
-            pool.shutdown(wait=not lost, cancel_futures=True)
+            for future in running:
+                future.cancel()
+            pool.shutdown(wait=not lost)
         lost += running.values()
         return self._to_try_again(lost, kept)
 

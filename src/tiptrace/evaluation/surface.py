@@ -94,9 +94,14 @@ def fit_surface(traces: Sequence[Trace], tip_radius_m: float = 0.0) -> SurfaceFi
         )
         return SurfaceFit(tuple(traces), plane, None, None, tip_radius_m, tuple(notes))
     offset = traces[0].offset_std_m(plane.axes_B[1]) if len(traces) == 1 else float("nan")
-    return SurfaceFit(
-        tuple(traces), plane, fit_centreline(uv, offset), fit_periodic(uv), tip_radius_m, tuple(notes)
-    )
+    periodic = fit_periodic(uv)
+    if len(traces) == 1 and periodic is None:
+        notes.append(
+            "a single trace cannot tell its own slow errors from the groove: the band of the centreline counts only "
+            "what changes from pair to pair; trace it again for an honest one"
+        )
+    centreline = fit_centreline(uv, offset, periodic)
+    return SurfaceFit(tuple(traces), plane, centreline, periodic, tip_radius_m, tuple(notes))
 
 
 def surface_table(fit: SurfaceFit) -> Table:

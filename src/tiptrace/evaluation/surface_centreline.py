@@ -9,6 +9,7 @@ import numpy as np
 
 from tiptrace.evaluation.serial_noise import ar1_covariance, lag_one
 from tiptrace.evaluation.smoothing_spline import SmoothingSpline
+from tiptrace.evaluation.surface_periodic import PeriodicFit
 from tiptrace.types import FloatArray
 
 _LEAST_POINTS = 12
@@ -53,7 +54,9 @@ class CentrelineFit:
         return self.across_m - factor * self.std_m, self.across_m + factor * self.std_m
 
 
-def fit_centreline(traces: Sequence[FloatArray], offset_std_m: float = float("nan")) -> CentrelineFit | None:
+def fit_centreline(
+    traces: Sequence[FloatArray], offset_std_m: float = float("nan"), periodic: PeriodicFit | None = None
+) -> CentrelineFit | None:
     """Smoothing spline v(u) through traces (n_k, 2) m in plane coordinates; None where they are too short.
 
     Traces of one groove differ mostly by the error of their anchors. Each is moved as a whole onto their mean
@@ -63,6 +66,8 @@ def fit_centreline(traces: Sequence[FloatArray], offset_std_m: float = float("na
     Args:
         traces: Positions along and across the travel.
         offset_std_m: Standard deviation across of a single trace's anchor, where known.
+        periodic: What was found to repeat. A single trace cannot tell its noise from the groove, and the spline
+            follows both; the sinusoid's scatter then stands in for the noise of the band.
     """
     span = max((float(np.ptp(t[:, 0])) for t in traces if len(t)), default=0.0)
     cell = max(_CELL_M, span / _MOST_CELLS)
@@ -76,7 +81,11 @@ def fit_centreline(traces: Sequence[FloatArray], offset_std_m: float = float("na
     g = spline.fit(v, smoothing)
     residuals = [c[:, 1] - spline.at(g, c[:, 0]) for c in cells]
     grid = np.linspace(u[0], u[-1], _GRID)
-    std, noise = _std(grid, merged, smoothing, residuals)
+    noise, serial = _noise(SmoothingSpline(u, traces_there), smoothing, residuals)
+    if len(cells) == 1 and periodic is not None and periodic.noise_m > noise:
+        noise = periodic.noise_m
+        serial = float(np.exp(-cell / periodic.memory_m)) if periodic.memory_m > 0 else 0.0
+    std = _std(grid, merged, smoothing, noise, serial)
     spread = float(np.std(shifts, ddof=1)) if len(shifts) > 1 else offset_std_m
     return CentrelineFit(
         along_m=grid,
@@ -84,7 +93,7 @@ def fit_centreline(traces: Sequence[FloatArray], offset_std_m: float = float("na
         std_m=std,
         offset_std_m=spread / float(np.sqrt(len(shifts))),
         noise_m=noise,
-        serial=lag_one(residuals),
+        serial=serial,
         smoothing=smoothing,
     )
 
@@ -158,20 +167,18 @@ def _best_smoothing(folds: Sequence[FloatArray], cell: float) -> float:
     return float(_LAMBDAS_M3[np.argmin(errors)])
 
 
-def _std(
-    grid: FloatArray, merged: Merged, smoothing: float, residuals: Sequence[FloatArray]
-) -> tuple[FloatArray, float]:
-    """Standard deviation of the spline on the grid (g,), and of the noise of one trace's cell, m.
+def _noise(spline: SmoothingSpline, smoothing: float, residuals: Sequence[FloatArray]) -> tuple[float, float]:
+    """Noise of one trace's cell, m, and its serial correlation; what the curve takes of it is added back."""
+    freedom = float(np.trace(spline.matrix(smoothing)))
+    rows, total = sum(len(r) for r in residuals), sum(float(r @ r) for r in residuals)
+    return float(np.sqrt(total / max(1.0, rows - freedom))), lag_one(residuals)
 
-    The spline is linear in the data; what it takes from them as curve is added back to the noise.
-    """
+
+def _std(grid: FloatArray, merged: Merged, smoothing: float, noise: float, serial: float) -> FloatArray:
+    """Standard deviation of the spline on the grid, (g,): it is linear in the data."""
     u, _, traces = merged
     spline = SmoothingSpline(u, traces)
-    S = spline.matrix(smoothing)  # (m, m)
-    response = spline.at(S, grid)  # (g, m)
-    rows, total = sum(len(r) for r in residuals), sum(float(r @ r) for r in residuals)
-    noise = float(np.sqrt(total / max(1.0, rows - float(np.trace(S)))))
-    serial = ar1_covariance(len(u), noise, lag_one(residuals)) / np.sqrt(np.outer(traces, traces))
-    return np.sqrt(
-        np.maximum(np.einsum("gi,ij,gj->g", response, serial, response, optimize=True), 0.0)
-    ), noise
+    response = spline.at(spline.matrix(smoothing), grid)  # (g, m)
+    covariance = ar1_covariance(len(u), noise, serial) / np.sqrt(np.outer(traces, traces))
+    variance = np.einsum("gi,ij,gj->g", response, covariance, response, optimize=True)
+    return np.asarray(np.sqrt(np.maximum(variance, 0.0)))

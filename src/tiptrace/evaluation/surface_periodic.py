@@ -25,6 +25,8 @@ class PeriodicFit:
         amplitude_m: Peak deviation.
         amplitude_std_m: Its standard deviation.
         r2: Part of the lateral variance that the sinusoid explains.
+        noise_m: Scatter about it.
+        memory_m: Way along the travel over which the scatter is forgotten (to 1/e); 0 where it has no memory.
     """
 
     period_m: float
@@ -32,6 +34,8 @@ class PeriodicFit:
     amplitude_m: float
     amplitude_std_m: float
     r2: float
+    noise_m: float = 0.0
+    memory_m: float = 0.0
 
 
 def fit_periodic(traces: Sequence[FloatArray]) -> PeriodicFit | None:
@@ -95,7 +99,9 @@ def _describe(traces: Sequence[FloatArray], frequency: float) -> PeriodicFit:
         J[:, 0] = 2 * np.pi * u * (-c[0] * np.sin(w) + c[1] * np.cos(w))  # ∂v/∂f
         J[:, 1 + 4 * k : 5 + 4 * k] = _design(u, frequency)
         jacobians.append(J)
-    covariance = sandwich(jacobians, sigma, lag_one(residuals))
+    phi = lag_one(residuals)
+    covariance = sandwich(jacobians, sigma, phi)
+    step = float(np.median(np.concatenate([np.abs(np.diff(t[:, 0])) for t in traces])))
     amplitudes = np.array([np.hypot(c[0], c[1]) for c in coefficients])
     gradient = np.zeros(q)  # of the mean amplitude
     for k, (c, a) in enumerate(zip(coefficients, amplitudes, strict=True)):
@@ -107,4 +113,6 @@ def _describe(traces: Sequence[FloatArray], frequency: float) -> PeriodicFit:
         amplitude_m=float(amplitudes.mean()),
         amplitude_std_m=float(np.sqrt(gradient @ covariance @ gradient)),
         r2=1.0 - total / variance if variance > 0 else 0.0,
+        noise_m=sigma,
+        memory_m=-step / float(np.log(phi)) if phi > 0 else 0.0,
     )
