@@ -66,7 +66,7 @@ def _pull_push(weighted: Float32Map, weight: Float32Map) -> Float32Map:
     if weight.min() >= 1.0 or min(weight.shape) < 4:
         return np.asarray(weighted / np.maximum(weight, 1e-6)[..., None], dtype=np.float32)
     size = ((weight.shape[1] + 1) // 2, (weight.shape[0] + 1) // 2)
-    coarse_sum = cv2.pyrDown(weighted, dstsize=size)
+    coarse_sum = cv2.pyrDown(weighted, dstsize=size).reshape(size[1], size[0], -1)
     coarse_weight = cv2.pyrDown(weight, dstsize=size)
     confidence = np.minimum(coarse_weight * 2.0, 1.0)  # half a cell of knowledge is enough
     scale = confidence / np.maximum(coarse_weight, 1e-6)

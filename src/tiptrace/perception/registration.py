@@ -1,0 +1,132 @@
+"""Tracking that cannot drift: frame to frame for speed, each dot measured anew in every frame.
+
+Lucas–Kanade brings each marker close; its dot's own centroid says where it is, so that no error is handed on.
+A forward–backward check, the dot's ink and area, and the neighbours' displacement decide whether it is the right
+dot. A marker that fails is lost in this frame; its place is predicted from its neighbours until the dot shows
+again.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tiptrace.perception.centroid import DotMeasurement, DotMeter
+from tiptrace.perception.markers import Markers
+from tiptrace.perception.neighbourhood import Neighbourhood
+from tiptrace.perception.tracking import Grey, grey_image, lucas_kanade
+from tiptrace.types import BoolArray, FloatArray, Image
+
+_BACK_PX = 1.0  # forward–backward mismatch
+_AREA = (0.4, 2.2)  # of the first frame's
+_INK = 0.45  # of the first frame's contrast
+_OFF_GRID = 0.38  # of the pitch: distance from where the neighbours say
+_SEARCH = 0.45  # of the pitch: how far from its predicted place a lost dot is looked for …
+_FOUND = 0.6  # … and may be found
+
+
+class RegisteredTracker:
+    """The full method's tracker. Attribute ``expected_px`` (n, 2): where lost markers are thought to be."""
+
+    def __init__(self, image: Image, markers: Markers) -> None:
+        """Start on the image in which the markers were detected."""
+        self._grey = grey_image(image)
+        self._around = Neighbourhood(markers.uv_px)
+        diameter = float(np.median(markers.diameter_px))
+        self._meter = DotMeter(diameter, self._around.pitch_px)
+        first = self._meter.measure(self._grey, markers.uv_px)
+        moved = np.linalg.norm(first.uv_px - markers.uv_px, axis=1)
+        self._rest = np.where((moved < 0.5 * diameter)[:, None], first.uv_px, markers.uv_px)
+        self._ink, self._area = first.ink, first.area_px
+        self._margin = 0.4 * diameter
+        self._tracked = np.ones(len(markers), dtype=np.bool_)
+        self.expected_px: FloatArray = self._rest.copy()
+
+    @property
+    def start_px(self) -> FloatArray:
+        """Positions (n, 2) in the first image."""
+        return self._rest.copy()
+
+    def update(self, image: Image) -> tuple[FloatArray, BoolArray]:
+        """Track into the next image: uv_px (n, 2), NaN where lost, and tracked (n,)."""
+        grey = grey_image(image)
+        guess, followed = self._follow(grey)
+        dots = self._meter.measure(grey, guess)
+        seen = self._is_dot(dots, np.arange(len(guess)), grey.shape) & self._near(dots.uv_px, guess, followed)
+        uv, seen = self._search(grey, guess, dots.uv_px, seen)
+        seen = self._agree(uv, seen)
+        predicted, _ = self._around.predict(uv - self._rest, seen)
+        self.expected_px = np.where(seen[:, None], uv, self._rest + predicted)
+        self._tracked, self._grey = seen, grey
+        return np.where(seen[:, None], uv, np.nan), seen.copy()
+
+    def _follow(self, grey: Grey) -> tuple[FloatArray, BoolArray]:
+        """Lucas–Kanade there and back; where that fails, the neighbours' displacement."""
+        start = self.expected_px
+        moved, there = lucas_kanade(self._grey, grey, start)
+        back, again = lucas_kanade(grey, self._grey, moved, start)
+        mismatch = np.linalg.norm(back - start, axis=1)
+        followed = there & again & (mismatch < _BACK_PX) & self._tracked
+        predicted, enough = self._around.predict(moved - self._rest, followed)
+        off = np.linalg.norm(moved - self._rest - predicted, axis=1)
+        followed &= ~enough | (off < _OFF_GRID * self._around.pitch_px)
+        predicted, enough = self._around.predict(moved - self._rest, followed)
+        held = np.where(enough[:, None], self._rest + predicted, start)
+        return np.where(followed[:, None], moved, held), followed
+
+    def _is_dot(self, dots: DotMeasurement, which: NDArray[np.intp], shape: tuple[int, ...]) -> BoolArray:
+        """Whether measurements of some markers show a dot: dark, of the right size, not cut by the border."""
+        H, W = shape[:2]
+        ratio = dots.area_px / self._area[which]
+        whole = (dots.uv_px >= self._margin).all(axis=1) & (
+            dots.uv_px <= np.array([W - 1, H - 1]) - self._margin
+        ).all(axis=1)
+        ok = (dots.ink > _INK * self._ink[which]) & (ratio > _AREA[0]) & (ratio < _AREA[1]) & whole
+        return np.asarray(ok, dtype=np.bool_)
+
+    def _near(self, uv: FloatArray, guess: FloatArray, followed: BoolArray) -> BoolArray:
+        limit = np.where(followed, max(2.0, 0.12 * self._around.pitch_px), _SEARCH * self._around.pitch_px)
+        return np.asarray(np.linalg.norm(uv - guess, axis=1) < limit)
+
+    def _search(
+        self, grey: Grey, guess: FloatArray, uv: FloatArray, seen: BoolArray
+    ) -> tuple[FloatArray, BoolArray]:
+        """Look for missing dots around their predicted places, darkest first."""
+        missing = np.flatnonzero(~seen)
+        if not missing.size:
+            return uv, seen
+        uv, seen = uv.copy(), seen.copy()
+        smooth = cv2.GaussianBlur(grey, (0, 0), max(self._margin * 0.6, 0.8))
+        reach = int(np.ceil(_SEARCH * self._around.pitch_px))
+        H, W = grey.shape
+        for i in missing:
+            u, v = np.round(guess[i]).astype(int)
+            u0, u1, v0, v1 = max(u - reach, 0), min(u + reach + 1, W), max(v - reach, 0), min(v + reach + 1, H)
+            if u1 - u0 < 3 or v1 - v0 < 3:
+                continue
+            dark = np.unravel_index(int(np.argmin(smooth[v0:v1, u0:u1])), (v1 - v0, u1 - u0))
+            uv[i] = (u0 + dark[1], v0 + dark[0])
+        found = self._meter.measure(grey, uv[missing])
+        uv[missing] = found.uv_px
+        near = np.linalg.norm(found.uv_px - guess[missing], axis=1) < _FOUND * self._around.pitch_px
+        seen[missing] = self._is_dot(found, missing, grey.shape) & near
+        return uv, seen
+
+    def _agree(self, uv: FloatArray, seen: BoolArray) -> BoolArray:
+        """Drop markers off their neighbours' displacement, worst first, and two markers on one dot."""
+        seen = seen.copy()
+        for _ in range(3):
+            predicted, enough = self._around.predict(uv - self._rest, seen)
+            off = np.linalg.norm(uv - self._rest - predicted, axis=1)
+            bad = seen & enough & (off > _OFF_GRID * self._around.pitch_px)
+            if not bad.any():
+                break
+            worst = off * bad
+            seen &= ~(bad & (worst >= 0.7 * worst.max()))
+        distance = np.linalg.norm(uv[:, None] - uv[None], axis=2)
+        distance[~(seen[:, None] & seen[None])] = np.inf
+        np.fill_diagonal(distance, np.inf)
+        first, second = np.nonzero(np.triu(distance < self._margin))
+        seen[np.where(off[first] > off[second], first, second)] = False
+        return seen
