@@ -19,9 +19,9 @@ import numpy as np
 
 from tiptrace.geometry.transforms import rotation_log, skew
 from tiptrace.sim import trial as trial_module
-from tiptrace.sim.contact import GelLaw
 from tiptrace.sim.grasp import World
 from tiptrace.sim.groove import Groove, Pit, named_centreline
+from tiptrace.sim.pads import GelLaw
 from tiptrace.sim.rig import PADS_E
 from tiptrace.sim.spec import TrialSpec
 from tiptrace.sim.trial import PLATE_ORIGIN_B, FrameState, TrialPhysics
@@ -41,8 +41,8 @@ def our_trial(name: str) -> tuple[TrialPhysics, list[FrameState], FloatArray, tu
     rest = TrialPhysics(spec, np.zeros(3), Groove(named_centreline(name), Pit(depth_m=0.0)))
     far = rest.hand.pose(0.0)
     far[2, 3] += 0.02
-    rest._to_equilibrium(World(far, 0.9), 1e-9, "in the air")
-    e = rest._last
+    rest.stepper.rest(World(far, 0.9), 1e-9, "in the air")
+    e = rest.stepper.last
     lever = e.p - PADS_E
     T = np.eye(6)
     T[:3, 3:] = -skew(lever)  # tip velocity from the pads' centre's

@@ -8,11 +8,7 @@ CPU time and wall time are both printed: on a shared machine only the former is 
 from __future__ import annotations
 
 import argparse
-import os
 import time
-
-for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
-    os.environ.setdefault(variable, "1")
 
 import cv2
 

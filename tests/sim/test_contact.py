@@ -7,11 +7,13 @@ import pytest
 
 from tiptrace.geometry.transforms import rotation_exp, transform
 from tiptrace.sim.conditions import named_hold
-from tiptrace.sim.contact import GelLaw, Pads, PadState, TipLaw, TipState, advance_pads, pad_forces, tip_force
 from tiptrace.sim.grasp import Grasp, GraspState, World
 from tiptrace.sim.groove import Groove, Pit, named_centreline
+from tiptrace.sim.pad_forces import advance_pads, pad_forces
+from tiptrace.sim.pads import GelLaw, Pads, PadState
 from tiptrace.sim.rig import PADS_E, Placement, true_rig
 from tiptrace.sim.spec import TrialSpec
+from tiptrace.sim.tip import TipLaw, TipState, tip_force
 from tiptrace.sim.tools import TOOL_NAMES, ToolShape, make_tool
 from tiptrace.types import SIDES, FloatArray
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,10 +11,11 @@ from tests.sim.helpers import run, short_spec
 from tiptrace.errors import SimulationError
 from tiptrace.geometry.transforms import rotation_log
 from tiptrace.sim.conditions import CONDITIONS, paper_trials
-from tiptrace.sim.contact import GelLaw, TipLaw
 from tiptrace.sim.grasp import FORCE_TOLERANCE_N, MOMENT_TOLERANCE_NM, World
 from tiptrace.sim.groove import Groove, named_centreline
+from tiptrace.sim.pads import GelLaw
 from tiptrace.sim.spec import Dwell, FrictionDrop, Lift
+from tiptrace.sim.tip import TipLaw
 from tiptrace.sim.trial import PLATE_ORIGIN_B, FrameState, TrialPhysics
 
 
@@ -87,16 +90,8 @@ def test_friction_makes_the_tip_trail(t3: tuple[TrialPhysics, list[FrameState]])
 def test_a_closed_loop_creates_no_energy() -> None:
     """The hand moves in a closed loop with the tip in the pit: its work, less what is stored, is friction's."""
     physics = TrialPhysics(short_spec(), np.zeros(3))
-    physics.grasp = type(physics.grasp)(
-        physics.grasp.pads.__class__(
-            GelLaw(creep=0.0),
-            *(getattr(physics.grasp.pads, n) for n in ("area_m2", "X", "ex", "ey", "ez", "side")),
-        ),
-        physics.tool,
-        physics.grasp.groove,
-        physics.grasp.tip_law,
-        physics.grasp.origin_B,
-    )
+    stepper = physics.stepper
+    stepper.grasp = replace(stepper.grasp, pads=replace(stepper.grasp.pads, law=GelLaw(creep=0.0)))
     start = physics.hand.pose(0.0)
     weight = np.array([0, 0, -physics.tool.weight_n])
 
@@ -106,8 +101,8 @@ def test_a_closed_loop_creates_no_energy() -> None:
             a = 2 * np.pi * k / steps
             T = start.copy()
             T[:3, 3] += radius_m * np.array([np.cos(a) - 1, np.sin(a), 0.1 * np.sin(2 * a)])
-            physics._to_equilibrium(World(T, 0.9), 1e-9, "loop")
-            e = physics._last
+            stepper.rest(World(T, 0.9), 1e-9, "loop")
+            e = stepper.last
             force = -(e.tip.force + weight)  # of the hand on tool and pads
             if last is not None:
                 work += float(0.5 * (force + last[0]) @ (T[:3, 3] - last[1]))

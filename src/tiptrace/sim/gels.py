@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from tiptrace.geometry.transforms import invert
-from tiptrace.sim.contact import node_grid
 from tiptrace.sim.disturbances import MarkerNoise
 from tiptrace.sim.dots import DotLayout
 from tiptrace.sim.gel import GEL_GRID, GelDeformation, GelGrid, PadContact, deform, grid_over
 from tiptrace.sim.optics import Optics, gel_optics, unseen_optics
+from tiptrace.sim.pads import node_grid
 from tiptrace.sim.render import CameraNoise, TactileRenderer
 from tiptrace.sim.rig import IMAGE_SIZE_PX, MM_PER_PX, SIGN
 from tiptrace.sim.seeds import stream

@@ -7,19 +7,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from tiptrace.geometry.transforms import rotation_exp
-from tiptrace.sim.contact import (
-    PadForces,
-    Pads,
-    PadState,
-    TipForce,
-    TipLaw,
-    TipState,
-    advance_pads,
-    advance_tip,
-    pad_forces,
-    tip_force,
-)
 from tiptrace.sim.groove import Groove
+from tiptrace.sim.pad_forces import PadForces, advance_pads, pad_forces
+from tiptrace.sim.pads import Pads, PadState
+from tiptrace.sim.tip import TipForce, TipLaw, TipState, advance_tip, tip_force
 from tiptrace.sim.tools import ToolShape
 from tiptrace.types import FloatArray
 

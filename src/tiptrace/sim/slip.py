@@ -7,8 +7,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from tiptrace.sim.contact import PadForces, Pads
 from tiptrace.sim.grasp import GraspState
+from tiptrace.sim.pad_forces import PadForces
+from tiptrace.sim.pads import Pads
 from tiptrace.types import FloatArray
 
 _WINDOW_S = 0.4

@@ -8,27 +8,27 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from tiptrace.errors import SimulationError
-from tiptrace.geometry.transforms import interpolate, rotation_exp, transform
+from tiptrace.geometry.transforms import transform
 from tiptrace.sim.conditions import named_hold, named_wrist
-from tiptrace.sim.contact import FACE_M, GelLaw, PadForces, Pads, PadState, TipForce, TipLaw, TipState
-from tiptrace.sim.grasp import Equilibrium, Grasp, GraspState, World
+from tiptrace.sim.grasp import Grasp, GraspState, World
 from tiptrace.sim.groove import Groove, centreline_from_csv, named_centreline
+from tiptrace.sim.guard import Guard
+from tiptrace.sim.pad_forces import PadForces
+from tiptrace.sim.pads import FACE_M, GelLaw, Pads, PadState
 from tiptrace.sim.protocol import Hand, pad_friction, plan, tip_push
 from tiptrace.sim.rig import PADS_E, Placement, true_opening_m, true_rig
-from tiptrace.sim.slip import SlipMeter, drift_anchors
 from tiptrace.sim.spec import TrialSpec
+from tiptrace.sim.stepper import Stepper
+from tiptrace.sim.tip import TipForce, TipLaw, TipState
 from tiptrace.sim.tools import ToolShape, make_tool
 from tiptrace.types import SIDES, FloatArray, Phase
 
 PLATE_ORIGIN_B = np.array([0.35, -0.15, 0.02])
 MAX_STEP_S = 0.02
-_BISECTIONS = 6
 _PRESS_STEP_M = 0.1e-3
 _PRESS_LIMIT_M = 6e-3
-_GUARD_BAND = (0.8, 1.4)  # of the anchoring force
-_GUARD_GAIN = 0.7 / 3000.0  # m/N per step: a little under the grasp's own compliance along the tool
 _LEAST_GRIP_N = 0.5
-_FAST_MPS = 0.06  # a tip that moves faster has jumped: its speed predicts nothing
+_MOST_SAG_M = 8e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,99 +80,89 @@ class TrialPhysics:
     Attributes:
         spec: The trial.
         nominal_offset_E: (3,) error of the tip that the hand believes in.
+        groove: The plate; by default what the spec names.
         tool: The tool.
-        grasp: The mechanical system.
+        T_E_S: True sensor poses at the gripper's opening, by side.
+        stepper: The grasp as it goes.
         hand: The commanded motion, known once the grasp has settled and the tip is pressed down.
+        guard: Height of the hand above its plan.
     """
 
     spec: TrialSpec
     nominal_offset_E: FloatArray
     groove: Groove | None = None
     tool: ToolShape = field(init=False)
-    grasp: Grasp = field(init=False)
-    hand: Hand = field(init=False)
     T_E_S: dict[str, FloatArray] = field(init=False)
-    _state: GraspState = field(init=False)
-    _guard_m: float = field(init=False, default=0.0)
-    _guard_end_m: float = field(init=False, default=0.0)
-    _travel_rise_m: float = field(init=False, default=0.0)
-    _stiffness: float = field(init=False, default=4e3)
-    _anchored: bool = field(init=False, default=False)
-    _tip_B: FloatArray | None = field(init=False, default=None)
-    _velocity_B: FloatArray = field(init=False, default_factory=lambda: np.zeros(3))
-    _slip: SlipMeter = field(init=False)
+    stepper: Stepper = field(init=False)
+    hand: Hand = field(init=False)
+    guard: Guard = field(init=False)
 
     def __post_init__(self) -> None:
         spec = self.spec
         self.tool = make_tool(spec.tool, spec.thickness_m, spec.tool_length_m)
-        hold = named_hold(spec.grasp)
+        hold, wrist = named_hold(spec.grasp), named_wrist(spec.wrist)
         _check_reach(hold.above_tip_m, self.tool)
-        wrist = named_wrist(spec.wrist)
-        opening = true_opening_m(spec, self.tool)
-        if opening <= 0.0:
-            raise SimulationError(
-                f"an indentation of {spec.indentation_m * 1e3:.1f} mm per pad closes the gripper on a tool of "
-                f"{self.tool.thickness_m * 1e3:.1f} mm; use less than half its thickness"
-            )
+        _check_opening(spec, self.tool)
         rig = true_rig(spec)
-        self.T_E_S = {side: rig.T_E_S(side, opening) for side in SIDES}
-        d = spec.disturbed_by
-        law = GelLaw(youngs_pa=GelLaw().youngs_pa * d.gel_stiffness, stiffening=d.gel_stiffening)
+        self.T_E_S = {side: rig.T_E_S(side, true_opening_m(spec, self.tool)) for side in SIDES}
         if self.groove is None:
             line = (
                 named_centreline(spec.trajectory) if spec.curve is None else centreline_from_csv(spec.curve)
             )
             self.groove = Groove(line)
         self.groove.line.check(self.groove.radius_m)
-        self.grasp = Grasp(Pads.at(self.T_E_S, law), self.tool, self.groove, TipLaw(), PLATE_ORIGIN_B)
-        placement = Placement.of(hold, self.tool)
-        self._state = GraspState(placement.R, placement.p, PadState.fresh(len(self.grasp.pads)), TipState())
-        self._slip = SlipMeter(self.grasp.pads)
+        d = spec.disturbed_by
+        law = GelLaw(youngs_pa=GelLaw().youngs_pa * d.gel_stiffness, stiffening=d.gel_stiffening)
+        pads, place = Pads.at(self.T_E_S, law), Placement.of(hold, self.tool)
+        grasp = Grasp(pads, self.tool, self.groove, TipLaw(), PLATE_ORIGIN_B)
+        state = GraspState(place.R, place.p, PadState.fresh(len(pads)), TipState())
+        self.stepper = Stepper(grasp, state, f"{spec.name}, seed {spec.seed}")
+        self.guard = Guard(spec, self.groove.pit.depth_m)
         T_B_E = self._press_down(self._settle(wrist.R_B_E))
         if spec.anchoring_s == 0.0:
             T_B_E = self._rise(T_B_E)
-        nominal = self._state.p + self.nominal_offset_E
-        self.hand = Hand(spec, plan(spec), T_B_E, nominal, PADS_E)
+        self.hand = Hand(spec, plan(spec), T_B_E, self.stepper.state.p + self.nominal_offset_E, PADS_E)
+
+    @property
+    def grasp(self) -> Grasp:
+        """The mechanical system."""
+        return self.stepper.grasp
 
     # --- before the first frame -----------------------------------------------------------------------------
 
     def _settle(self, R_B_E: FloatArray) -> FloatArray:
         """Close the fingers on the tool in the air and let the gel relax; returns the hand above the pit."""
-        assert self.groove is not None
-        start = self.groove.line.points(np.zeros(1))[0] + PLATE_ORIGIN_B
-        T = transform(R_B_E, start + [0, 0, 5e-3] - R_B_E @ self._state.p)
-        world = World(T, self.grasp.pads.law.friction)
-        self._state = self.grasp.take_hold(self._state, world)
+        stepper, grasp = self.stepper, self.grasp
+        start = grasp.groove.line.points(np.zeros(1))[0] + PLATE_ORIGIN_B
+        placed = stepper.state.p
+        world = World(transform(R_B_E, start + [0, 0, 5e-3] - R_B_E @ placed), grasp.pads.law.friction)
+        stepper.state = grasp.take_hold(stepper.state, world)
         for _ in range(8):
-            self._to_equilibrium(world, 4.0, "closing the fingers")
-        grip = self._last.pads.normal_n.sum() / 2
-        moved = float(np.linalg.norm(self._state.p - Placement.of(named_hold(self.spec.grasp), self.tool).p))
-        if grip < _LEAST_GRIP_N or moved > 8e-3:
+            stepper.rest(world, 4.0, "closing the fingers")
+        grip = stepper.last.pads.normal_n.sum() / 2
+        sag = float(np.linalg.norm(stepper.state.p - placed))
+        if grip < _LEAST_GRIP_N or sag > _MOST_SAG_M:
             raise SimulationError(
-                f"the grasp does not hold the tool: {grip:.2f} N of grip per pad, the tip sagged {moved * 1e3:.1f} mm; "
+                f"the grasp does not hold the tool: {grip:.2f} N of grip per pad, the tip sagged {sag * 1e3:.1f} mm; "
                 f"raise indentation_m or hold the tool nearer to its middle"
             )
-        T[:3, 3] = start - R_B_E @ self._state.p
-        T[2, 3] += 0.1e-3
-        return T
+        return transform(R_B_E, start + [0, 0, 0.1e-3] - R_B_E @ stepper.state.p)
 
     def _press_down(self, T_B_E: FloatArray) -> FloatArray:
         """Lower the hand until the groove pushes back with the anchoring force, then let it rest."""
-        T = T_B_E.copy()
+        T, stepper = T_B_E.copy(), self.stepper
         mu, wanted = self.grasp.pads.law.friction, self.spec.anchor_force_n
-        self._to_equilibrium(World(T, mu), 0.05, "pressing down")
+        stepper.rest(World(T.copy(), mu), 0.05, "pressing down")
         force = lowered = 0.0
         stiffness = 3e3
         while force < wanted - 0.01:
-            step = (
-                _PRESS_STEP_M
-                if force < 0.3
-                else float(np.clip((wanted - force) / stiffness, 1e-6, _PRESS_STEP_M))
-            )
+            step = _PRESS_STEP_M
+            if force > 0.3:
+                step = float(np.clip((wanted - force) / stiffness, 1e-6, _PRESS_STEP_M))
             T[2, 3] -= step
             lowered += step
-            self._to_equilibrium(World(T.copy(), mu), 0.05, "pressing down")
-            before, force = force, float(self._last.tip.force[2])
+            stepper.rest(World(T.copy(), mu), 0.05, "pressing down")
+            before, force = force, float(stepper.last.tip.force[2])
             if before > 0.3:
                 stiffness = max((force - before) / step, 500.0)
             if lowered > _PRESS_LIMIT_M:
@@ -181,28 +171,27 @@ class TrialPhysics:
                     f"{force:.2f} N of the {wanted:.1f} N asked for"
                 )
         for _ in range(10):
-            self._to_equilibrium(World(T, mu), 0.2, "resting")
+            stepper.rest(World(T, mu), 0.2, "resting")
         self._probe(T)
         return T
 
     def _probe(self, T_B_E: FloatArray) -> None:
         """Measure the grasp's stiffness along z by a small lift."""
-        T, mu = T_B_E.copy(), self.grasp.pads.law.friction
-        pressed = float(self._last.tip.force[2])
+        T, mu, stepper = T_B_E.copy(), self.grasp.pads.law.friction, self.stepper
+        pressed = float(stepper.last.tip.force[2])
         T[2, 3] += _PRESS_STEP_M
-        self._to_equilibrium(World(T, mu), 0.05, "probing")
-        self._stiffness = max((pressed - float(self._last.tip.force[2])) / _PRESS_STEP_M, 500.0)
-        self._to_equilibrium(World(T_B_E, mu), 0.05, "probing")
+        stepper.rest(World(T, mu), 0.05, "probing")
+        self.guard.stiffness = max((pressed - float(stepper.last.tip.force[2])) / _PRESS_STEP_M, 500.0)
+        stepper.rest(World(T_B_E, mu), 0.05, "probing")
 
     def _rise(self, T_B_E: FloatArray) -> FloatArray:
         """Without Stage I the trial starts at the height of the travel."""
-        self._plan_rise(0.0)
-        rise, T, mu = self._travel_rise_m, T_B_E.copy(), self.grasp.pads.law.friction
-        self._travel_rise_m = 0.0
+        rise = self.guard.plan_travel(0.0, float(self.stepper.last.tip.force[2]))
+        T, mu = T_B_E.copy(), self.grasp.pads.law.friction
         steps = int(np.ceil(abs(rise) / _PRESS_STEP_M)) + 1
         for _ in range(steps):
             T[2, 3] += rise / steps
-            self._to_equilibrium(World(T.copy(), mu), 0.05, "rising")
+            self.stepper.rest(World(T.copy(), mu), 0.05, "rising")
         return T
 
     # --- the trial ------------------------------------------------------------------------------------------
@@ -218,142 +207,27 @@ class TrialPhysics:
         Raises:
             SimulationError: no equilibrium, the tool torn out of the pads; the frame is named.
         """
-        spec = self.spec
+        spec, stepper = self.spec, self.stepper
         substeps = int(np.ceil(1.0 / spec.fps / MAX_STEP_S - 1e-9))
         friction = pad_friction(spec, self.grasp.pads.law.friction)
         drift_rad_s = np.radians(spec.disturbed_by.grasp_drift_deg) / max(self.hand.duration_s, 1e-9)
         T_last, t_last = self.hand.pose(0.0), 0.0
-        self._slip.reset()
+        stepper.slip.reset()
         for index in range(self.frame_count):
             retried = False
             for k in range(substeps if index else 1):
-                t = (
-                    index / spec.fps
-                    if k == substeps - 1 or not index
-                    else ((index - 1) + (k + 1) / substeps) / spec.fps
-                )
+                t = (index - 1 + (k + 1) / substeps) / spec.fps if index else 0.0
                 dt = max(t - t_last, 1e-4)
                 T = self.hand.pose(t)
-                self._guard(t)
-                T[2, 3] += self._guard_m
-                self._state = drift_anchors(self.grasp.pads, self._state, drift_rad_s * dt)
-                self._slip.rotation_deg -= float(np.degrees(drift_rad_s * dt))
-                mu, push = friction(t), tip_push(spec, t)
-                retried |= self._move(T_last, T, mu, push, dt, f"frame {index}")
+                T[2, 3] += self.guard.update(t, self.hand.segment(t), float(stepper.last.tip.force[2]))
+                stepper.drift(drift_rad_s * dt)
+                world = World(T, friction(t), tip_push(spec, t))
+                retried |= stepper.move(T_last, world, dt, f"frame {index}")
                 T_last, t_last = T, t
             yield self._frame(index, t_last, T_last, retried)
 
-    def _guard(self, t: float) -> None:
-        """Height of the hand above its plan: a force guard in Stage I, then what the travel's preload needs.
-
-        While the hand turns about a tip that it knows badly, it yields along z whenever the contact force leaves
-        its band; then it moves to the height of the travel and stays there.
-        """
-        segment = self.hand.segment(t)
-        if not segment.anchoring:
-            if t > 0.0 and not self._anchored:
-                self._plan_rise(segment.from_m)
-                self._guard_m = self._travel_rise_m
-            return
-        moving_until = segment.end_s - segment.rest_s
-        if t <= moving_until:
-            self._anchored = False
-            if self.spec.anchor_guard:
-                N = float(self._last.tip.force[2])
-                force = self.spec.anchor_force_n if segment.start_s == 0.0 else self.spec.preload_n
-                low, high = (b * force for b in _GUARD_BAND)
-                self._guard_m += _GUARD_GAIN * (max(N - high, 0.0) - max(low - N, 0.0))
-            return
-        if not self._anchored:
-            self._plan_rise(segment.from_m)
-        u = (t - moving_until) / segment.rest_s
-        self._guard_m = self._guard_end_m + (self._travel_rise_m - self._guard_end_m) * u * u * (
-            3.0 - 2.0 * u
-        )
-
-    def _plan_rise(self, travelled_m: float) -> None:
-        """Decide on the height of the travel: from the force now to the preload, and out of the pit."""
-        assert self.groove is not None
-        self._anchored = True
-        self._guard_end_m = self._guard_m
-        climb = self.groove.pit.depth_m if travelled_m == 0.0 else 0.0
-        excess = float(self._last.tip.force[2]) - self.spec.preload_n
-        self._travel_rise_m = self._guard_m + climb + excess / self._stiffness
-
-    def _move(
-        self, T_from: FloatArray, T_to: FloatArray, mu: float, push: FloatArray, dt: float, where: str
-    ) -> bool:
-        """One step of the hand, cut into halves where the solver needs it. True if it did."""
-        if self._try(World(T_to, mu, push), dt):
-            return False
-        pieces = [(0.0, 1.0, 0)]
-        while pieces:
-            a, b, depth = pieces.pop()
-            T = interpolate(T_from, T_to, b)
-            world, step = World(T, mu, push), dt * (b - a)
-            if (depth and self._try(world, step)) or self._relaxes(world, step):
-                continue
-            if depth == _BISECTIONS:
-                self._fail(where)
-            middle = 0.5 * (a + b)
-            pieces += [(middle, b, depth + 1), (a, middle, depth + 1)]
-        return True
-
-    def _try(self, world: World, dt: float) -> bool:
-        R, p = self._predict(world, dt)
-        equilibrium = self.grasp.solve(self._state, world, R, p, dt)
-        if not equilibrium.converged:
-            return False
-        self._accept(equilibrium, world, dt)
-        return True
-
-    def _predict(self, world: World, dt: float) -> tuple[FloatArray, FloatArray]:
-        """First guess: the tip goes on as it went in the base, the tool turns about the pads to follow it."""
-        R, p = self._state.R, self._state.p
-        if self._tip_B is None:
-            return R, p
-        T = world.T_B_E
-        p_new = T[:3, :3].T @ (self._tip_B + self._velocity_B * dt - T[:3, 3])
-        lever = p - PADS_E
-        w = np.cross(lever, p_new - p) / float(lever @ lever)
-        R_new = rotation_exp(w)
-        along = lever / np.linalg.norm(lever)
-        return R_new @ R, PADS_E + R_new @ lever + along * float(along @ (p_new - p))
-
-    def _relaxes(self, world: World, dt: float) -> bool:
-        equilibrium = self.grasp.relax(self._state, world, self._state.R, self._state.p, dt)
-        if not equilibrium.converged:
-            return False
-        self._accept(equilibrium, world, dt)
-        return True
-
-    def _accept(self, equilibrium: Equilibrium, world: World, dt: float) -> None:
-        before = self._state
-        self._state = self.grasp.advance(before, equilibrium, dt)
-        self._slip.add(before, self._state, equilibrium.pads, dt)
-        self._last = equilibrium
-        tip_B = world.T_B_E[:3, :3] @ equilibrium.p + world.T_B_E[:3, 3]
-        if self._tip_B is not None:
-            velocity = (tip_B - self._tip_B) / dt
-            self._velocity_B = velocity if np.linalg.norm(velocity) < _FAST_MPS else np.zeros(3)
-        self._tip_B = tip_B
-
-    def _to_equilibrium(self, world: World, dt: float, where: str) -> None:
-        self._tip_B, self._velocity_B = None, np.zeros(3)
-        if not (self._try(world, dt) or self._relaxes(world, dt)):
-            self._fail(where)
-
-    def _fail(self, where: str) -> None:
-        raise SimulationError(
-            f"{self.spec.name}, seed {self.spec.seed}: no equilibrium at {where}; the tool is being torn out of the "
-            f"pads or the groove: lower preload_n or speed_mps, or raise indentation_m"
-        )
-
-    _last: Equilibrium = field(init=False)
-
     def _frame(self, index: int, t: float, T_B_E: FloatArray, retried: bool) -> FrameState:
-        e = self._last
-        tip_B = T_B_E[:3, :3] @ e.p + T_B_E[:3, 3]
+        e, slip = self.stepper.last, self.stepper.slip
         if e.pads.normal_n.sum() < _LEAST_GRIP_N:
             raise SimulationError(f"{self.spec.name}: the grasp lost the tool at frame {index}")
         return FrameState(
@@ -364,13 +238,21 @@ class TrialPhysics:
             T_E_T=transform(e.R, e.p),
             pads=e.pads,
             tip=e.tip,
-            tip_B=tip_B,
-            slip_deg=self._slip.rotation_deg,
-            slip_m=self._slip.translation_m,
-            creeping=self._slip.creeping(),
+            tip_B=T_B_E[:3, :3] @ e.p + T_B_E[:3, 3],
+            slip_deg=slip.rotation_deg,
+            slip_m=slip.translation_m,
+            creeping=slip.creeping(),
             force_residual_n=e.force_residual_n,
             moment_residual_nm=e.moment_residual_nm,
             retried=retried,
+        )
+
+
+def _check_opening(spec: TrialSpec, tool: ToolShape) -> None:
+    if true_opening_m(spec, tool) <= 0.0:
+        raise SimulationError(
+            f"an indentation of {spec.indentation_m * 1e3:.1f} mm per pad closes the gripper on a tool of "
+            f"{tool.thickness_m * 1e3:.1f} mm; use less than half its thickness"
         )
 
 

@@ -1,4 +1,4 @@
-"""Contact laws of the virtual rig: two pads of point springs, and the tip in its groove.
+"""Forces of the pads' springs on the tool, with their exact derivative.
 
 Everything is expressed in F_E, where the pads are at rest. A wrench is (6,): force and moment about the tip; a
 stiffness (6, 6) is its derivative by (v, w), the tool's translation of the tip and rotation about it.
@@ -6,128 +6,17 @@ stiffness (6, 6) is its derivative by (v, w), the tool's translation of the tip 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tiptrace.geometry.transforms import skew
-from tiptrace.sim.groove import Groove
+from tiptrace.sim.pads import GelLaw, Pads, PadState
 from tiptrace.sim.tools import Overlap, ToolShape
-from tiptrace.types import SIDES, BoolArray, FloatArray
+from tiptrace.types import BoolArray, FloatArray
 
 IntArray = NDArray[np.intp]
-
-
-@dataclass(frozen=True, slots=True)
-class GelLaw:
-    """Mechanics of a pad: E, ν and thickness give the springs (design, section 7).
-
-    Attributes:
-        youngs_pa: Young's modulus.
-        poisson: Poisson's ratio.
-        thickness_m: Gel thickness h.
-        confinement: k_n = confinement · E / h, since the gel cannot escape sideways.
-        friction: Coulomb coefficient between pad and tool.
-        creep: Fraction of the stiffness that relaxes.
-        creep_s: Its time constant.
-        stiffening: Growth of the normal stiffness with strain: f = k δ (1 + stiffening · δ / h).
-    """
-
-    youngs_pa: float = 0.15e6
-    poisson: float = 0.48
-    thickness_m: float = 4e-3
-    confinement: float = 1.9
-    friction: float = 0.9
-    creep: float = 0.10
-    creep_s: float = 8.0
-    stiffening: float = 0.0
-
-    @property
-    def normal(self) -> float:
-        """k_n, N/m³."""
-        return self.confinement * self.youngs_pa / self.thickness_m
-
-    @property
-    def shear(self) -> float:
-        """k_s = G/h, N/m³."""
-        return self.youngs_pa / (2.0 * (1.0 + self.poisson)) / self.thickness_m
-
-
-NODES = (20, 15)  # springs per pad along x_S and y_S
-FACE_M = (20e-3, 15e-3)
-_STAGGER = (0.0, 0.4, -0.2, 0.2, -0.4)  # of the pitch, column by column
-
-
-def node_grid() -> FloatArray:
-    """(300, 2) rest positions of one pad's springs in the gel plane of F_S, m.
-
-    Columns are staggered along y: a tool's edge, which runs along x, meets springs one by one and not a whole row
-    at once, so that the force on it varies smoothly.
-    """
-    axes = [(np.arange(n) + 0.5) * (size / n) - 0.5 * size for n, size in zip(NODES, FACE_M, strict=True)]
-    x, y = np.meshgrid(*axes)
-    y = y + np.resize(_STAGGER, NODES[0]) * (FACE_M[1] / NODES[1])
-    return np.stack([x.ravel(), y.ravel()], axis=1)
-
-
-@dataclass(frozen=True, slots=True)
-class Pads:
-    """The springs of both pads in F_E, left first: n = 2 · 300.
-
-    Attributes:
-        law: Gel mechanics.
-        area_m2: Area of a spring.
-        X: (n, 3) rest positions.
-        ex: (n, 3) x_S of each spring's pad.
-        ey: (n, 3) y_S.
-        ez: (n, 3) z_S.
-        side: (n,) +1 left, −1 right.
-    """
-
-    law: GelLaw
-    area_m2: float
-    X: FloatArray
-    ex: FloatArray
-    ey: FloatArray
-    ez: FloatArray
-    side: FloatArray
-
-    @classmethod
-    def at(cls, T_E_S: dict[str, FloatArray], law: GelLaw) -> Pads:
-        """Pads at their sensor poses, (4, 4) each, by side."""
-        grid = node_grid()
-        T = np.stack([T_E_S[side] for side in SIDES])  # (2, 4, 4)
-        k = len(grid)
-        X = np.concatenate([grid @ Ti[:3, :2].T + Ti[:3, 3] for Ti in T])
-        ex, ey, ez = (np.repeat(T[:, :3, j], k, axis=0) for j in range(3))
-        area = FACE_M[0] * FACE_M[1] / k
-        return cls(law, area, X, ex, ey, ez, np.repeat([1.0, -1.0], k))
-
-    def __len__(self) -> int:
-        return len(self.X)
-
-
-@dataclass(frozen=True, slots=True)
-class PadState:
-    """Memory of the pads.
-
-    Attributes:
-        anchored: (n,) whether the spring holds the tool.
-        q: (n, 3) material point of the tool that each spring holds, F_T.
-        depth_v: (n,) relaxed part of the overlap, m.
-        shear_v: (n, 2) relaxed part of the shear, m.
-    """
-
-    anchored: BoolArray
-    q: FloatArray
-    depth_v: FloatArray
-    shear_v: FloatArray
-
-    @classmethod
-    def fresh(cls, n: int) -> PadState:
-        """Pads that touch nothing."""
-        return cls(np.zeros(n, dtype=bool), np.zeros((n, 3)), np.zeros(n), np.zeros((n, 2)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,9 +65,7 @@ def pad_forces(
     size, slipping = np.zeros(len(pads)), np.zeros(len(pads), dtype=bool)
     shear[k], tangential[k], size[k], slipping[k] = rub.shear.T, rub.t.T, normal.size, rub.slipping
     stored = normal.stored_j + 0.5 * law.shear * pads.area_m2 * float(np.sum(rub.shear**2))
-    return PadForces(
-        normal.wrench + rub.wrench, J, overlap.depth, size, shear, tangential, slipping, stored
-    )
+    return PadForces(normal.wrench + rub.wrench, J, overlap.depth, size, shear, tangential, slipping, stored)
 
 
 @dataclass(frozen=True, slots=True)
@@ -272,7 +159,9 @@ def _friction_forces(
     u = t / size
     t = t * scale
     Gx, Gy = _wrenches(a, ex), _wrenches(a, ey)
-    stick = np.where(holds, ks * creep.instant * scale, 0.0)  # return mapping: stiff across the slip direction
+    stick = np.where(
+        holds, ks * creep.instant * scale, 0.0
+    )  # return mapping: stiff across the slip direction
     along = np.where(slipping, stick, 0.0)
     J = -(Gx * (stick - along * u[0] ** 2)) @ Gx.T - (Gy * (stick - along * u[1] ** 2)) @ Gy.T
     G_slip = np.zeros((6, 0))
@@ -332,113 +221,3 @@ def advance_pads(
         depth_v=(state.depth_v + rho * depth) / (1.0 + rho),
         shear_v=(state.shear_v + rho * forces.shear) / (1.0 + rho),
     )
-
-
-# --- tip ---------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True)
-class TipLaw:
-    """Tip in the groove.
-
-    Attributes:
-        normal: Stiffness of the contact, N/m.
-        tangential: Stiffness of sticking friction, N/m.
-        kinetic: Coefficient while sliding.
-        ageing: How much rest adds to it.
-        ageing_s: Rest for 63 % of that.
-    """
-
-    normal: float = 50e3
-    tangential: float = 20e3
-    kinetic: float = 0.2
-    ageing: float = 0.04
-    ageing_s: float = 1.0
-
-
-@dataclass(frozen=True, slots=True)
-class TipState:
-    """Memory of the tip: where it last stuck (None: not in contact), and for how long it has rested."""
-
-    anchor: FloatArray | None = None
-    rest_s: float = 0.0
-
-
-@dataclass(frozen=True, slots=True)
-class TipForce:
-    """What the groove does to the tip, plate axes.
-
-    Attributes:
-        force: (3,) N.
-        stiffness: (3, 3) its derivative by the tip's position.
-        normal_n: Magnitude of the normal force.
-        friction: (3,) the friction part.
-        normal: (3,) unit normal out of the wall.
-        slipping: At the friction cone.
-        anchor: (3,) where friction holds from now on.
-        penetration_m: Of the tip's sphere into the wall.
-        where: floor, wall, edge, plate, or ``free``.
-        stored_j: Elastic energy.
-    """
-
-    force: FloatArray
-    stiffness: FloatArray
-    normal_n: float
-    friction: FloatArray
-    normal: FloatArray
-    slipping: bool
-    anchor: FloatArray | None
-    penetration_m: float
-    where: str
-    stored_j: float = 0.0
-
-
-_FREE = TipForce(np.zeros(3), np.zeros((3, 3)), 0.0, np.zeros(3), np.zeros(3), False, None, 0.0, "free")
-
-
-def tip_force(
-    groove: Groove, radius_m: float, law: TipLaw, state: TipState, p: FloatArray, kinetic: float | None = None
-) -> TipForce:
-    """Force of the groove on a tip at p (3,), plate coordinates.
-
-    Friction acts at the sphere's centre: the spin moment μ N r is left out (2 % of the moment about the pads).
-    """
-    gap = groove.gap(p)
-    pen = radius_m - gap.distance_m
-    if pen <= 0.0:
-        return replace(_FREE, penetration_m=pen)
-    g, H = gap.gradient, gap.hessian
-    k = law.normal
-    size = float(np.linalg.norm(g))
-    n = g / size
-    N = k * pen * size
-    force, J = k * pen * g, k * (pen * H - np.outer(g, g))
-    stored = 0.5 * k * pen * pen
-    if state.anchor is None:
-        return TipForce(force, J, N, np.zeros(3), n, False, p.copy(), pen, gap.where, stored)
-    P = np.eye(3) - np.outer(n, n)
-    e = p - state.anchor
-    t = -law.tangential * (P @ e)
-    dn = P @ H / size  # (3, 3) dn/dp
-    dt = -law.tangential * (P - dn * float(n @ e) - np.outer(n, e @ dn))
-    mu = law.kinetic if kinetic is None else kinetic
-    mu += law.ageing * (1.0 - float(np.exp(-state.rest_s / law.ageing_s)))
-    t_size = float(np.linalg.norm(t))
-    limit = mu * N
-    if t_size <= limit:
-        stored += 0.5 * t_size**2 / law.tangential
-        return TipForce(force + t, J + dt, N, t, n, False, state.anchor, pen, gap.where, stored)
-    u = t / t_size
-    dN = k * (-g * size + pen * (H @ n))
-    friction = limit * u
-    dt = (limit / t_size) * (dt - np.outer(u, u @ dt)) + mu * np.outer(u, dN)
-    anchor = p + friction / law.tangential
-    stored += 0.5 * limit**2 / law.tangential
-    return TipForce(force + friction, J + dt, N, friction, n, True, anchor, pen, gap.where, stored)
-
-
-def advance_tip(state: TipState, force: TipForce, dt_s: float) -> TipState:
-    """Memory after a converged step."""
-    if force.anchor is None:
-        return TipState()
-    return TipState(force.anchor, 0.0 if force.slipping or state.anchor is None else state.rest_s + dt_s)
