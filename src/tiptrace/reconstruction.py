@@ -21,8 +21,18 @@ from tiptrace.evaluation.truth import Truth
 from tiptrace.outputs import write_results
 from tiptrace.pipeline import STEPS, Step, open_tracer, replay, trace
 from tiptrace.streams.sync_report import SyncReport
-from tiptrace.tracer import TipTracer, make_tracer
-from tiptrace.types import SIDES, FloatArray, ImageSample, Phase, SensedPair, Side, Stream, TruthSample
+from tiptrace.tracer import TipTracer, make_tracer, sensing_of
+from tiptrace.types import (
+    SIDES,
+    FloatArray,
+    ImageSample,
+    Phase,
+    SensedPair,
+    Side,
+    Stream,
+    TipTrajectory,
+    TruthSample,
+)
 
 
 class Trial(Stream, Protocol):
@@ -92,14 +102,14 @@ def reconstruct(
     Raises:
         TipTraceError: the recording cannot give a trajectory; the message says why.
     """
+    samples = stream.truth()
+    truth = Truth.from_samples(samples) if samples else None
     sync, watch = SyncReport(), _Watch(on_pair, keep_pairs=bool(beside), keep_images=report)
     with open_tracer(stream, method) as tracer:
         watch.tracer = tracer
         trajectory = trace(stream, tracer, watch, sync)
-    others = (MethodResult(m, replay(watch.pairs, make_tracer(stream, m))) for m in beside)
+    others = (MethodResult(m, _beside(stream, m, method, watch.pairs, truth)) for m in beside)
     methods = (MethodResult(method, trajectory), *others)
-    samples = stream.truth()
-    truth = Truth.from_samples(samples) if samples else None
     notes = (*stream.notes, *sync.sentences())
     metrics, quality = evaluate(trajectory, truth), _with_notes(assess(trajectory), notes)
     write_results(out, trajectory, method, metrics, quality)
@@ -123,6 +133,17 @@ def reconstruct(
         )
         page = write_trial_report(out, data)
     return Reconstruction(methods, metrics, quality, truth, page, notes)
+
+
+def _beside(
+    stream: Stream, method: str, main: str, pairs: Sequence[SensedPair], truth: Truth | None
+) -> TipTrajectory:
+    """A further method: over the markers already sensed where it runs on the same chain."""
+    truth_at = None if truth is None else lambda stamp_ns: truth.at([stamp_ns])[0]
+    if sensing_of(method) == sensing_of(main):
+        return replay(pairs, make_tracer(stream, method, truth_at=truth_at))
+    with open_tracer(stream, method) as tracer:
+        return trace(stream, tracer)
 
 
 def _with_notes(quality: Quality, notes: Sequence[str]) -> Quality:

@@ -8,11 +8,13 @@ the sensor frames (lines 3 and 5). An ``Estimator`` takes them to the base frame
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import Any, Literal
 
-from tiptrace.config import Rig, Tool
+from tiptrace.config import Rig
 from tiptrace.errors import ConfigError, PerceptionError
+from tiptrace.estimation.baselines import EeOracleEstimator, LocalAnchoringEstimator, NominalTipEstimator
 from tiptrace.estimation.ee_only import EeOnlyEstimator, Estimator
+from tiptrace.estimation.full import FullEstimator
 from tiptrace.estimation.paper import PaperEstimator
 from tiptrace.perception.finger import Finger
 from tiptrace.perception.gel_model import load_gel_model
@@ -22,6 +24,7 @@ from tiptrace.types import (
     Anchor,
     Event,
     FingerMarkers,
+    FloatArray,
     ImageSample,
     Observation,
     SensedFinger,
@@ -30,6 +33,9 @@ from tiptrace.types import (
     Stream,
     TipEstimate,
 )
+
+TruthAt = Callable[[int], FloatArray]
+"""True tip (3,) in F_B at a stamp, ns."""
 
 Map = Callable[[Callable[[Side], Any], Iterable[Side]], Iterable[Any]]
 """Applies a function to both sides: the built-in ``map``, or an executor's for one thread per finger."""
@@ -101,25 +107,50 @@ class TipTracer:
 
 
 METHODS: dict[str, str] = {
+    "full": "maximum-likelihood anchor, weighted motion, tip map, covariance, integrity",
     "paper": "the paper's method to the letter",
-    "ee-only": "baseline: end-effector pose with the tip constant, from the paper's anchor",
+    "ee-only": "baseline: end-effector pose with the tip constant, from full's anchor",
+    "ee-oracle": "baseline: end-effector pose with the tip constant, from the true anchor",
+    "nominal-tip": "baseline: end-effector pose with the tip of tool.yaml",
+    "local-anchoring": "baseline: the paper's Stage I in a sliding window",
 }
 
 
-def make_estimator(method: str, rig: Rig, tool: Tool | None = None) -> Estimator:
+def sensing_of(method: str) -> Literal["paper", "full"]:
+    """Which sensing chain a method runs on."""
+    return "paper" if method == "paper" else "full"
+
+
+def make_estimator(method: str, stream: Stream, truth_at: TruthAt | None = None) -> Estimator:
     """The estimator of a method.
 
+    Args:
+        method: One of :data:`METHODS`.
+        stream: For its rig and tool.
+        truth_at: True tip at a stamp, for ``ee-oracle`` only.
+
     Raises:
-        ConfigError: an unknown name; the valid ones are listed.
+        ConfigError: an unknown name (the valid ones are listed), or no truth for the oracle.
+        GeometryError: ``nominal-tip`` without a tip in the tool's file.
     """
+    if method == "full":
+        return FullEstimator(rig=stream.rig, tool=stream.tool)
     if method == "paper":
         return PaperEstimator()
     if method == "ee-only":
-        return EeOnlyEstimator(PaperEstimator())
+        return EeOnlyEstimator(FullEstimator(rig=stream.rig, tool=stream.tool))
+    if method == "nominal-tip":
+        return NominalTipEstimator(stream.tool)
+    if method == "local-anchoring":
+        return LocalAnchoringEstimator()
+    if method == "ee-oracle":
+        if truth_at is None:
+            raise ConfigError("method 'ee-oracle' needs a ground truth, which this trial does not have")
+        return EeOracleEstimator(truth_at)
     raise ConfigError(f"unknown method '{method}'; valid: {', '.join(METHODS)}")
 
 
-def make_tracer(stream: Stream, method: str, both: Map = map) -> TipTracer:
+def make_tracer(stream: Stream, method: str, both: Map = map, truth_at: TruthAt | None = None) -> TipTracer:
     """A tracer for a stream: sensing and estimator as a method wants them."""
-    sensing = Sensing(stream, SensingConfig(method="paper"), both)
-    return TipTracer(sensing, make_estimator(method, stream.rig, stream.tool))
+    estimator = make_estimator(method, stream, truth_at)
+    return TipTracer(Sensing(stream, SensingConfig(method=sensing_of(method)), both), estimator)

@@ -13,7 +13,7 @@ import typer
 def reconstruct(
     recording: Annotated[Path, typer.Argument(help="Recording (.mcap), or any ROS 2 bag with --map.")],
     out: Annotated[Path, typer.Option(help="Results folder.")] = Path("out"),
-    method: Annotated[str, typer.Option(help="paper or ee-only.")] = "paper",
+    method: Annotated[str, typer.Option(help="full, paper, or a baseline: ee-only, nominal-tip, …")] = "full",
     beside: Annotated[
         list[str] | None, typer.Option(help="Further method for the table and pictures; may be repeated.")
     ] = None,
