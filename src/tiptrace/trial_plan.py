@@ -3,13 +3,30 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from tiptrace.errors import ConfigError
 from tiptrace.evaluation.conditions import Condition
 from tiptrace.evaluation.runner import TrialTask
+from tiptrace.sim.disturbances import LEVELS, Disturbances, LevelName, MarkerNoise
+from tiptrace.sim.spec import make_spec
 from tiptrace.sim.suite import suite_trials
 from tiptrace.trial_runs import recording_source, simulated_source
+
+_OPENING_M = 0.5e-3
+_BUDGET: dict[str, tuple[str, ...]] = {
+    "white marker noise": ("markers.in_plane_m", "markers.depth_m"),
+    "slow depth tilt": ("markers.tilt_rad", "markers.tilt_s"),
+    "depth bias and gain": ("markers.bias_m", "markers.shown_depth"),
+    "shown shear": ("shown_shear",),
+    "sensor rotation (T_E_S)": ("T_E_S_rotation_deg",),
+    "sensor position (T_E_S)": ("T_E_S_translation_m",),
+    "gripper opening": ("opening_m",),
+    "latency": ("latency_s",),
+    "robot pose noise": ("pose_noise_m", "pose_noise_deg"),
+    "nominal tip": ("nominal_tip_m",),
+    "slow slip in the grasp": ("grasp_drift_deg",),
+}
 
 
 def suite_tasks(suite: str, level: str, mode: Any, seed: int, analytic: str | None) -> list[TrialTask]:
@@ -26,6 +43,45 @@ def suite_tasks(suite: str, level: str, mode: Any, seed: int, analytic: str | No
         source = simulated_source(spec.model_dump(mode="json", exclude_none=True), curve)
         tasks.append(TrialTask(trial.name, source, condition, spec.level, spec.seed))
     return tasks
+
+
+def budget_tasks(level: str, seed: int, repeats: int) -> dict[str, list[TrialTask]]:
+    """Trials of (T3, O1, W1, G1) at marker level with one disturbance at a time, by its name.
+
+    Each has the strength that it has at the level; what the level leaves out has the strength of ``hard``, and the
+    gripper's opening is 0.5 mm off. ``none`` has no disturbance at all, ``all`` is the level itself.
+
+    Raises:
+        SimulationError: an unknown level.
+    """
+    make_spec(level=level)
+    return {
+        name: [_budget_task(name, disturbances, seed * 100 + k) for k in range(repeats)]
+        for name, disturbances in _one_at_a_time(level).items()
+    }
+
+
+def _one_at_a_time(level: str) -> dict[str, Disturbances]:
+    chosen, hard = LEVELS[cast(LevelName, level)], LEVELS["hard"]
+    values = {**hard.model_dump(), **{k: v for k, v in chosen.model_dump().items() if v}}
+    values["opening_m"] = _OPENING_M
+    plan: dict[str, Disturbances] = {"none": Disturbances()}
+    for name, fields in _BUDGET.items():
+        own = {field: values[field] for field in fields if "." not in field}
+        markers = {
+            f.removeprefix("markers."): values["markers"][f.removeprefix("markers.")]
+            for f in fields
+            if "." in f
+        }
+        plan[name] = Disturbances(**own, markers=MarkerNoise(**markers))
+    return plan | {"all": chosen}
+
+
+def _budget_task(name: str, disturbances: Disturbances, seed: int) -> TrialTask:
+    spec = make_spec(mode="markers", seed=seed, disturbances=disturbances)
+    condition = Condition(spec.trajectory, spec.tool, spec.wrist, spec.grasp)
+    source = simulated_source(spec.model_dump(mode="json", exclude_none=True))
+    return TrialTask(f"{name}, seed {seed}", source, condition, "budget", seed)
 
 
 def recording_tasks(

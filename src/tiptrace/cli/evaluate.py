@@ -37,6 +37,12 @@ def evaluate(
         str, typer.Option(help="Of a suite: images or markers; default as the suite has it.")
     ] = "default",
     seed: Annotated[int, typer.Option(min=0, help="Of a suite.")] = 0,
+    budget: Annotated[
+        int,
+        typer.Option(
+            min=0, help="Also an error budget: trials with one disturbance at a time, so many of each."
+        ),
+    ] = 0,
     workers: Annotated[int, typer.Option(min=0, help="Processes; 0: one per core.")] = 0,
     scheduler: Annotated[
         str | None, typer.Option(help="Address of a Dask scheduler, e.g. tcp://node01:8786.")
@@ -93,9 +99,11 @@ def evaluate(
         for note in notes:
             console.print(f"note: {note}", highlight=False, markup=False)
     store.claim(settings)
-    records = _run(tasks, names, store, workers or os.cpu_count() or 1, scheduler)
+    workers = workers or os.cpu_count() or 1
+    records = _run(tasks, names, store, workers, scheduler)
     records = _report_outliers(tasks, names, store, records)
-    page = _report(store, records, settings, suite)
+    found = _run_budget(level, seed, budget, names, store, workers, scheduler)
+    page = _report(store, records, found, settings, suite)
     _show(console, records, page)
     if any(r.failure for r in records):
         raise typer.Exit(1)
@@ -150,6 +158,29 @@ def _run(
         return run.run(tasks)
 
 
+def _run_budget(
+    level: str,
+    seed: int,
+    repeats: int,
+    methods: list[str],
+    store: SuiteStore,
+    workers: int,
+    scheduler: str | None,
+) -> dict[str, list[TrialRecord]]:
+    """Records with one disturbance at a time, by its name; nothing where none were asked for."""
+    from tiptrace.evaluation.suite_store import SuiteStore
+    from tiptrace.trial_plan import budget_tasks
+
+    if repeats == 0:
+        return {}
+    plan = budget_tasks(level, seed, repeats)
+    kept = SuiteStore(store.folder / "budget")
+    kept.claim({"level": level, "seed": str(seed), "methods": ",".join(methods)})
+    records = _run([task for tasks in plan.values() for task in tasks], methods, kept, workers, scheduler)
+    of_trial = {task.name: name for name, tasks in plan.items() for task in tasks}
+    return {name: [r for r in records if of_trial[r.trial] == name] for name in plan}
+
+
 def _report_outliers(
     tasks: list[TrialTask], methods: list[str], store: SuiteStore, records: list[TrialRecord]
 ) -> list[TrialRecord]:
@@ -175,7 +206,11 @@ def _report_outliers(
 
 
 def _report(
-    store: SuiteStore, records: list[TrialRecord], settings: dict[str, str], suite: str | None
+    store: SuiteStore,
+    records: list[TrialRecord],
+    budget: dict[str, list[TrialRecord]],
+    settings: dict[str, str],
+    suite: str | None,
 ) -> Path:
     from tiptrace.evaluation.suite_report import SuiteData, write_suite_report
     from tiptrace.evaluation.versions import library_versions
@@ -186,6 +221,7 @@ def _report(
         title=title,
         records=records,
         traces=lambda: store.traces(records),
+        budget=budget,
         settings={k: v for k, v in settings.items() if v},
         versions=library_versions(),
         command=shlex.join(["tiptrace", *sys.argv[1:]]),

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_ARROW_PX = 22.0  # length that the longest arrow should about reach
+_ARROW_PX = 22.0  # length that a typical arrow should about reach
 _HAIR = "#FFFFFF"
 
 
@@ -175,13 +175,14 @@ def _draw_arrows(ax: Axes, view: TactileView, factor: int) -> None:
 
 
 def _arrow_factor(views: tuple[TactileView, ...]) -> int:
-    lengths = [
-        float(np.nanmax(np.linalg.norm(v.uv_last_px - v.uv_first_px, axis=1)))
+    """Enlargement at which most arrows can be seen; single long ones may reach further."""
+    moves = [
+        np.linalg.norm(v.uv_last_px - v.uv_first_px, axis=1)
         for v in views
         if v.uv_first_px is not None and v.uv_last_px is not None and np.isfinite(v.uv_last_px).any()
     ]
-    longest = max(lengths, default=0.0)
-    return max(f for f in (1, 2, 3, 5, 10, 20) if f == 1 or f * longest <= _ARROW_PX) if longest > 0 else 1
+    typical = float(np.nanpercentile(np.concatenate(moves), 75)) if moves else 0.0
+    return max((f for f in (1, 2, 3, 5, 10, 20) if f * typical <= _ARROW_PX), default=1) if typical > 0 else 1
 
 
 def _depths(view: TactileView) -> list[tuple[str, FloatArray]]:

@@ -11,7 +11,14 @@ from tiptrace.evaluation import published, style
 from tiptrace.evaluation.conditions import CONDITION_SETS, VARIED, Condition, sets_of
 from tiptrace.evaluation.records import TrialRecord
 from tiptrace.evaluation.statistics import spearman, summarise
-from tiptrace.evaluation.suite_tables import BASELINES, aligned, methods_of, set_values, values_by_trial
+from tiptrace.evaluation.suite_tables import (
+    BASELINES,
+    aligned,
+    methods_of,
+    metric_heading,
+    set_values,
+    values_by_trial,
+)
 from tiptrace.evaluation.traces import TrialTraces
 from tiptrace.types import FloatArray
 
@@ -182,7 +189,7 @@ def error_budget(budget: Mapping[str, Sequence[TrialRecord]], metric: str = "tra
     ax.set_yticks(range(len(budget)), list(budget))
     ax.invert_yaxis()
     ax.grid(visible=False, axis="y")
-    ax.set(xlabel=f"{metric.replace('_rmse_mm', ' RMSE').replace('_', ' ')} [mm]")
+    ax.set(xlabel=metric_heading(metric))
     ax.set_title("One disturbance at a time: mean over trials, whisker to the 95th percentile")
     figure.legend(loc="outside lower center", ncols=len(methods))
     return figure

@@ -59,7 +59,7 @@ def overlay_3d(data: ReportData) -> Figure:
     """The trace in space, equal axes."""
     figure = style.new_figure(7.2, 3.3)
     figure.set_layout_engine("none")  # the layout engine leaves a wide margin about a long thin box
-    ax: Any = figure.add_axes((-0.19, -0.92, 1.3, 2.84), projection="3d")
+    ax: Any = figure.add_axes((-0.19, -0.91, 1.3, 2.84), projection="3d")
     origin, _, _ = _view(data)
     spans = []
     for line in _lines(data):
@@ -75,7 +75,7 @@ def overlay_3d(data: ReportData) -> Figure:
     ax.view_init(elev=26, azim=-62)
     for axis, size in zip("xyz", span, strict=True):
         ax.locator_params(axis=axis, nbins=max(2, round(6 * size / span.max())))
-    ax.set_xlabel("x [mm]", labelpad=16)
+    ax.set_xlabel("x [mm]", labelpad=40)
     ax.set_ylabel("y [mm]", labelpad=2)
     ax.set_zlabel("z [mm]", labelpad=-4)
     ax.tick_params(pad=0, labelsize=8)

@@ -15,7 +15,7 @@ from tiptrace.evaluation.conditions import Condition
 from tiptrace.evaluation.embedding import FIGURES, EmbeddedFigure, embed_figure, render
 from tiptrace.evaluation.records import TrialRecord
 from tiptrace.evaluation.style import figure_style
-from tiptrace.evaluation.suite_tables import BASELINES, methods_of, outliers, suite_tables
+from tiptrace.evaluation.suite_tables import BASELINES, budget_table, methods_of, outliers, suite_tables
 from tiptrace.evaluation.tables import write_tables
 from tiptrace.evaluation.traces import TrialTraces
 
@@ -57,6 +57,8 @@ def write_suite_report(folder: Path, data: SuiteData) -> Path:
         OutputError: the folder or a file cannot be written.
     """
     tables = suite_tables(data.records)
+    if data.budget:
+        tables.append(budget_table(data.budget))
     write_tables(folder / "tables", tables)
     try:
         (folder / FIGURES).mkdir(parents=True, exist_ok=True)
@@ -119,4 +121,6 @@ def _figures(data: SuiteData) -> Iterator[tuple[str, str, str, Figure]]:
             yield f"overlays_{method}", f"Traces: {method}", caption, draw.overlays(data.traces(), method)
     if data.budget:
         caption = "Simulated with one disturbance at a time, all others off."
-        yield "error_budget", "Error budget", caption, draw.error_budget(data.budget)
+        for metric, title in (("initial_contact_error_mm", "the anchor"), ("shape_rmse_mm", "the shape")):
+            figure = draw.error_budget(data.budget, metric)
+            yield f"error_budget_{metric}", f"Error budget of {title}", caption, figure

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -48,6 +48,11 @@ def suite_tables(records: Sequence[TrialRecord]) -> list[Table]:
 def methods_of(records: Sequence[TrialRecord]) -> list[str]:
     """Methods in the order of their first record."""
     return list(dict.fromkeys(r.method for r in records))
+
+
+def metric_heading(metric: str) -> str:
+    """A metric's name with its unit, for headings and axes."""
+    return _NAMES[metric]
 
 
 def values_by_trial(records: Sequence[TrialRecord], method: str, metric: str) -> dict[str, float]:
@@ -253,6 +258,24 @@ def events_table(records: Sequence[TrialRecord]) -> Table:
         "Events",
         columns(*heads),
         rows_of([[*key, *counts] for key, counts in totals.items() if any(counts)]),
+    )
+
+
+def budget_table(budget: Mapping[str, Sequence[TrialRecord]]) -> Table:
+    """Errors with one disturbance at a time: where they enter, at the anchor or on the way."""
+    rows: list[list[Cell]] = []
+    for name, records in budget.items():
+        for method in methods_of(records):
+            found = [summarise(list(values_by_trial(records, method, m).values())) for m in MAIN_METRICS]
+            rows.append([name, method, found[0].n, *(mean_std(s.mean, s.std) for s in found)])
+    return Table(
+        "budget",
+        "Error budget: one disturbance at a time, mean ± std",
+        columns(
+            *(("disturbance", "disturbance"), ("method", "method"), ("n", "trials")),
+            *((m, _NAMES[m]) for m in MAIN_METRICS),
+        ),
+        rows_of(rows),
     )
 
 
