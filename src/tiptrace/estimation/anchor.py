@@ -182,7 +182,7 @@ class _Problem:
             P = np.linalg.inv(self.prior.covariance)
             N[:3, :3] += P
             b[:3] += P @ (self.prior.c - state.theta[:3])
-        N += 1e-12 * np.trace(N) * np.eye(6)
+        N += max(1e-12 * float(np.trace(N)), 1e-9) * np.eye(6)
         step = np.linalg.solve(N, b)
         k = np.einsum("tij,tj->ti", S_inv, w + A @ step)  # (T, 3)
         c = state.theta[:3]

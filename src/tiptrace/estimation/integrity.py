@@ -6,6 +6,7 @@ what the frame is worth.
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,28 +15,28 @@ from pydantic import BaseModel, ConfigDict, Field
 from tiptrace.estimation.motion import Motions
 from tiptrace.types import BoolArray, FloatArray
 
+_BEFORE, _AFTER = 10, 4  # frames compared for a slip
+
 
 class IntegrityConfig(BaseModel):
     """Limits."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    frozen_m: float = Field(
-        default=2e-7, gt=0
-    )  # no marker of a finger moved by more: the image is the old one
+    # no marker of a finger moved by more: the image is the old one
+    frozen_m: float = Field(default=2e-7, gt=0)
     stale_frames: int = Field(default=3, ge=2)
-    misfit_ratio: float = Field(
-        default=3.0, gt=1
-    )  # of the rigid fit's χ² to Stage I's: the tool slips in the grasp
-    misfit_floor: float = Field(default=0.7, gt=0)  # χ² of a clean fit is not taken for less
-    slip_frames: int = Field(default=2, ge=1)
-    jump_m: float = Field(
-        default=4e-4, gt=0
-    )  # of one marker between two frames, beyond the tool's own motion
-    twist_limit_rad: float = Field(default=0.02, gt=0)  # of one pad's markers against the other's
-    release_m: float = Field(
-        default=3.5e-4, gt=0
-    )  # the tool springs out along its axis when the tip lifts off
+    # A slip shears part of the markers: χ² of the rigid fit steps up and stays, mostly while the tip jumps.
+    # Under growing friction χ² also grows, but slowly.
+    misfit_step: float = Field(default=0.6, gt=0)  # of χ², and as a share of its level before
+    misfit_step_alone: float = Field(default=4.0, gt=0)  # the same, without a jump of the tip
+    tip_jump_m: float = Field(default=1.3e-3, gt=0)  # of the tip against the hand between two frames
+    # of one marker between two frames, beyond the tool's own motion
+    jump_m: float = Field(default=1.2e-3, gt=0)
+    twist_limit_rad: float = Field(default=0.03, gt=0)  # of one pad's markers against the other's
+    twist_frames: int = Field(default=3, ge=1)
+    # the tool springs out along its axis when the tip lifts off
+    release_m: float = Field(default=4.5e-4, gt=0)
     contact_frames: int = Field(default=2, ge=1)
     pose_gap_s: float = Field(default=0.1, gt=0)
 
@@ -101,8 +102,8 @@ class Monitor:
         self._last_S: FloatArray | None = None
         self._last_residual: FloatArray | None = None
         self._same = np.zeros(2, dtype=int)
-        self._misfits = 0
-        self._away = 0
+        self._recent: deque[tuple[float, FloatArray]] = deque(maxlen=_BEFORE + _AFTER)  # χ², D
+        self._away = self._twisted = 0
         self._contact = True
 
     def repeated(self, x_S: FloatArray, pad: FloatArray) -> tuple[bool, bool]:
@@ -142,20 +143,39 @@ class Monitor:
             repeated: From :meth:`repeated`.
         """
         c = self._config
-        misfit = motions.chi2[0] > c.misfit_ratio * max(ref.chi2, c.misfit_floor)
-        self._misfits = self._misfits + 1 if misfit else 0
-        axial = float((motions.R[0] @ c_E + motions.t[0] - c_E) @ ref.axis_E)
+        D = motions.R[0] @ c_E + motions.t[0] - c_E
+        axial = float(D @ ref.axis_E)
         self._judge_contact(axial, ref)
+        slipping = self._slipped(float(motions.chi2[0]), D)
         limit = max(c.twist_limit_rad, 6.0 * ref.twist_spread_rad)
+        twisted = abs(twist_rad - ref.twist_rad) > limit
+        self._twisted = self._twisted + 1 if twisted else 0
         return Findings(
             repeated=repeated,
             frozen=self.frozen,
-            slipping=self._misfits >= c.slip_frames,
+            slipping=slipping,
             jumped=self._jumped(residual_E),
-            disagree=abs(twist_rad - ref.twist_rad) > limit,
+            disagree=self._twisted >= c.twist_frames,
             in_contact=self._contact,
             axial_m=axial,
         )
+
+    def _slipped(self, chi2: float, D: FloatArray) -> bool:
+        """Whether χ² stepped up between the frames before and the last few."""
+        self._recent.append((chi2, D))
+        if len(self._recent) < _BEFORE + _AFTER:
+            return False
+        rows = list(self._recent)
+        before = float(np.median([q for q, _ in rows[:_BEFORE]]))
+        step = float(np.median([q for q, _ in rows[_BEFORE:]])) - before
+        path = np.stack([d for _, d in rows[_BEFORE - 2 :]])
+        jump = float(np.linalg.norm(np.diff(path, axis=0), axis=1).max())
+        c = self._config
+        alone = step > c.misfit_step_alone * max(1.0, before)
+        with_jump = step > c.misfit_step * max(1.0, before) and jump > c.tip_jump_m
+        if alone or with_jump:
+            self._recent.clear()  # the level after the slip is the new one
+        return bool(alone or with_jump)
 
     def _judge_contact(self, axial_m: float, ref: Reference) -> None:
         """The preload holds the tool back; without contact it springs out by the preload over the stiffness."""

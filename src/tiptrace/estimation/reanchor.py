@@ -60,7 +60,7 @@ class Reanchoring:
             return None
         try:
             anchoring = self._segment.solve((known.latency_s, 2e-3), None)
-        except GeometryError:
+        except (GeometryError, np.linalg.LinAlgError):
             return None
         self._segment, self._count = self._like.fresh(), 0
         self._rows.clear()
