@@ -21,6 +21,8 @@ from .builders import straight_truth, trajectory_of, truth_of
 from .suite_builders import metrics, suite
 from .test_trial_report import Page
 
+SVG = ("svg",)
+
 
 def traces() -> Iterator[tuple[Condition, TrialTraces]]:
     for condition in distinct_conditions():
@@ -39,14 +41,14 @@ def test_the_page_holds_tables_figures_and_outliers(tmp_path: Path):
     data = SuiteData(
         "Suite", records, traces, budget, {"level": "nominal"}, {"numpy": "2"}, "tiptrace evaluate"
     )
-    text = write_suite_report(tmp_path, data).read_text(encoding="utf-8")
+    text = write_suite_report(tmp_path, data, SVG).read_text(encoding="utf-8")
     page = Page(text)
     assert page.open == []
     links = [s for s in page.sources if not s.startswith("data:image/")]
     assert links == ["trials/a/report.html"]
     for heading in (
         "Mean ± std over trials",
-        "Error budget",
+        "Error budget of the anchor",
         "Traces: full",
         "Outliers",
         "Failures",
@@ -71,7 +73,8 @@ def test_the_page_holds_tables_figures_and_outliers(tmp_path: Path):
 )
 def test_hardly_any_records_still_give_a_page(tmp_path: Path, records: list[TrialRecord]):
     assert (
-        Page(write_suite_report(tmp_path, SuiteData("few", records)).read_text(encoding="utf-8")).open == []
+        Page(write_suite_report(tmp_path, SuiteData("few", records), SVG).read_text(encoding="utf-8")).open
+        == []
     )
 
 

@@ -19,6 +19,7 @@ from tiptrace.types import Phase, Status, TipEstimate, TipTrajectory
 from .builders import straight_truth, trajectory_of
 from .report_builders import full_report
 
+SVG = ("svg",)
 VOID = {"meta", "img", "br", "link"}
 
 
@@ -82,7 +83,7 @@ def test_everything_that_was_given_is_shown(full: tuple[Path, str]):
 def test_a_bare_trajectory_is_enough(tmp_path: Path):
     p = straight_truth()
     data = ReportData("bare", (MethodResult("full", trajectory_of(p, 5)),))
-    page = Page(write_trial_report(tmp_path, data).read_text(encoding="utf-8"))
+    page = Page(write_trial_report(tmp_path, data, SVG).read_text(encoding="utf-8"))
     assert page.headings == ["Result", "Where the tip went", "In space", "Anchoring fit", "Status and events"]
 
 
@@ -99,7 +100,7 @@ def test_a_bare_trajectory_is_enough(tmp_path: Path):
 def test_hardly_any_data_still_gives_a_page(tmp_path: Path, trajectory: TipTrajectory):
     data = replace(full_report(), methods=(MethodResult("paper", trajectory),), anchoring=None, tactile=())
     for variant in (data, replace(data, truth=None, step_ms={})):
-        assert Page(write_trial_report(tmp_path, variant).read_text(encoding="utf-8")).open == []
+        assert Page(write_trial_report(tmp_path, variant, SVG).read_text(encoding="utf-8")).open == []
 
 
 def test_gels_without_markers_depth_or_survivors(tmp_path: Path):
@@ -108,14 +109,14 @@ def test_gels_without_markers_depth_or_survivors(tmp_path: Path):
     uv = data.tactile[1].uv_first_px
     assert uv is not None
     dead = replace(data.tactile[1], uv_last_px=np.full_like(uv, np.nan), depth_last_mm=None, selected=None)
-    page = write_trial_report(tmp_path, replace(data, tactile=(bare, dead))).read_text(encoding="utf-8")
+    page = write_trial_report(tmp_path, replace(data, tactile=(bare, dead)), SVG).read_text(encoding="utf-8")
     assert "What the gels saw" in page
 
 
 def test_travel_in_any_direction_has_a_stretched_view(tmp_path: Path):
     p = straight_truth() @ np.array([[0.6, 0.8, 0], [-0.8, 0.6, 0], [0, 0, 1.0]])
     data = ReportData("turned", (MethodResult("full", trajectory_of(p, 5)),))
-    assert write_trial_report(tmp_path, data).exists()
+    assert write_trial_report(tmp_path, data, SVG).exists()
 
 
 def test_rows_hold_numbers_with_the_columns_units():

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tiptrace.evaluation.style import save_figure
+from tiptrace.evaluation.style import FORMATS, save_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -28,11 +28,17 @@ class EmbeddedFigure:
 
 
 def embed_figure(
-    folder: Path, name: str, title: str, caption: str, figure: Figure, bitmap: bool = False
+    folder: Path,
+    name: str,
+    title: str,
+    caption: str,
+    figure: Figure,
+    bitmap: bool = False,
+    formats: tuple[str, ...] = FORMATS,
 ) -> EmbeddedFigure:
-    """Save a figure in all formats and embed it, as SVG unless a bitmap is asked for."""
-    save_figure(figure, folder / name)
-    kind, mime = ("png", "image/png") if bitmap else ("svg", "image/svg+xml")
+    """Save a figure in the formats asked for and embed it, as SVG unless a bitmap is asked for."""
+    kind, mime = ("png", "image/png") if bitmap and "png" in formats else ("svg", "image/svg+xml")
+    save_figure(figure, folder / name, tuple(dict.fromkeys((*formats, kind))))
     encoded = base64.b64encode((folder / f"{name}.{kind}").read_bytes()).decode()
     width_px = round(_PX_PER_INCH * figure.get_figwidth())
     return EmbeddedFigure(name, title, caption, f"data:{mime};base64,{encoded}", width_px)

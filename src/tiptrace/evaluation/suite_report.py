@@ -14,7 +14,7 @@ from tiptrace.evaluation.atomic import write_atomic
 from tiptrace.evaluation.conditions import Condition
 from tiptrace.evaluation.embedding import FIGURES, EmbeddedFigure, embed_figure, render
 from tiptrace.evaluation.records import TrialRecord
-from tiptrace.evaluation.style import figure_style
+from tiptrace.evaluation.style import FORMATS, figure_style
 from tiptrace.evaluation.suite_tables import BASELINES, budget_table, methods_of, outliers, suite_tables
 from tiptrace.evaluation.tables import write_tables
 from tiptrace.evaluation.traces import TrialTraces
@@ -50,8 +50,8 @@ class SuiteData:
     notes: tuple[str, ...] = ()
 
 
-def write_suite_report(folder: Path, data: SuiteData) -> Path:
-    """Write ``report.html``, ``figures/`` and ``tables/``; returns the page's path.
+def write_suite_report(folder: Path, data: SuiteData, formats: tuple[str, ...] = FORMATS) -> Path:
+    """Write ``report.html``, ``figures/`` (png, svg or pdf as asked) and ``tables/``; returns the page's path.
 
     Raises:
         OutputError: the folder or a file cannot be written.
@@ -64,7 +64,7 @@ def write_suite_report(folder: Path, data: SuiteData) -> Path:
         (folder / FIGURES).mkdir(parents=True, exist_ok=True)
         with figure_style():
             figures = [
-                embed_figure(folder / FIGURES, name, title, caption, figure)
+                embed_figure(folder / FIGURES, name, title, caption, figure, formats=formats)
                 for name, title, caption, figure in _figures(data)
             ]
     except OSError as error:

@@ -14,7 +14,7 @@ from tiptrace.evaluation.embedding import FIGURES, EmbeddedFigure, embed_figure,
 from tiptrace.evaluation.quality import assess
 from tiptrace.evaluation.report_data import ReportData
 from tiptrace.evaluation.result_table import COLUMNS, result_rows
-from tiptrace.evaluation.style import figure_style
+from tiptrace.evaluation.style import FORMATS, figure_style
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -108,8 +108,8 @@ _SECTIONS = (
 )
 
 
-def write_trial_report(folder: Path, data: ReportData) -> Path:
-    """Write ``report.html`` and ``figures/``; returns the page's path.
+def write_trial_report(folder: Path, data: ReportData, formats: tuple[str, ...] = FORMATS) -> Path:
+    """Write ``report.html`` and ``figures/``, each figure as png, svg or pdf as asked; returns the page's path.
 
     Raises:
         OutputError: the folder or a file cannot be written.
@@ -117,7 +117,7 @@ def write_trial_report(folder: Path, data: ReportData) -> Path:
     try:
         (folder / FIGURES).mkdir(parents=True, exist_ok=True)
         with figure_style():
-            figures = list(_figures(folder / FIGURES, data))
+            figures = list(_figures(folder / FIGURES, data, formats))
         page = folder / REPORT
         page.write_text(render_page(data, figures), encoding="utf-8")
     except OSError as error:
@@ -138,7 +138,7 @@ def render_page(data: ReportData, figures: list[EmbeddedFigure]) -> str:
     )
 
 
-def _figures(folder: Path, data: ReportData) -> Iterator[EmbeddedFigure]:
+def _figures(folder: Path, data: ReportData, formats: tuple[str, ...]) -> Iterator[EmbeddedFigure]:
     for s in _SECTIONS:
         if s.wanted(data):
-            yield embed_figure(folder, s.name, s.title, s.caption, s.draw(data), s.bitmap)
+            yield embed_figure(folder, s.name, s.title, s.caption, s.draw(data), s.bitmap, formats)
