@@ -60,7 +60,10 @@ class Disturbances(_Model):
         gel_stiffening: Growth of the normal stiffness with strain (0: linear springs).
         grasp_drift_deg: Rotation by which the tool creeps against the pads over the trial, unseen by the dots.
         illumination_drift: Relative change of each lamp over the trial, σ (mode ``images``).
-        optics: Which optics the images have.
+        camera_noise: Sensor noise and grain over those of a real GelSight Mini; 0 switches them off.
+        optics: ``fitted`` is the gel that the shading was fitted to, ``standard`` another of the same make,
+            ``unseen`` one from beyond that range.
+        gel_law: How the gel deforms around the contact; ``unseen`` bulges.
     """
 
     markers: MarkerNoise = MarkerNoise()
@@ -83,7 +86,9 @@ class Disturbances(_Model):
     gel_stiffening: Sigma = 0.0
     grasp_drift_deg: float = 0.0
     illumination_drift: Sigma = 0.0
-    optics: Literal["standard", "unseen"] = "standard"
+    camera_noise: Sigma = 1.0
+    optics: Literal["fitted", "standard", "unseen"] = "fitted"
+    gel_law: Literal["standard", "unseen"] = "standard"
 
 
 LEVELS: dict[LevelName, Disturbances] = {
@@ -103,6 +108,7 @@ LEVELS: dict[LevelName, Disturbances] = {
         pose_noise_m=0.05e-3,
         pose_noise_deg=0.03,
         illumination_drift=0.002,
+        optics="standard",
     ),
     "hard": Disturbances(
         markers=MarkerNoise(
@@ -117,6 +123,7 @@ LEVELS: dict[LevelName, Disturbances] = {
         pose_noise_deg=0.03,
         grasp_drift_deg=3.0,
         illumination_drift=0.004,
+        optics="standard",
     ),
     # Beyond the priors of any estimator here: frozen before the estimators were tuned.
     "unseen": Disturbances(
@@ -138,5 +145,6 @@ LEVELS: dict[LevelName, Disturbances] = {
         grasp_drift_deg=2.0,
         illumination_drift=0.008,
         optics="unseen",
+        gel_law="unseen",
     ),
 }

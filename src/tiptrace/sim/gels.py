@@ -9,7 +9,16 @@ import numpy as np
 from tiptrace.geometry.transforms import invert
 from tiptrace.sim.disturbances import MarkerNoise
 from tiptrace.sim.dots import DotLayout
-from tiptrace.sim.gel import GEL_GRID, GelDeformation, GelGrid, PadContact, deform, grid_over
+from tiptrace.sim.gel import (
+    GEL_GRID,
+    GelDeformation,
+    GelGrid,
+    GelParameters,
+    PadContact,
+    deform,
+    grid_over,
+    unseen_gel,
+)
 from tiptrace.sim.optics import Optics, gel_optics, unseen_optics
 from tiptrace.sim.pads import node_grid
 from tiptrace.sim.render import CameraNoise, TactileRenderer
@@ -34,6 +43,7 @@ class Gel:
         tool: What presses into it.
         grid: Where its surface is sampled.
         renderer: Its camera, and its dots.
+        parameters: How it deforms.
     """
 
     side: Side
@@ -41,6 +51,7 @@ class Gel:
     tool: ToolShape
     grid: GelGrid
     renderer: TactileRenderer
+    parameters: GelParameters
 
     def deformation(self, frame: FrameState) -> GelDeformation:
         """The gel's surface in a frame."""
@@ -51,7 +62,7 @@ class Gel:
         mine = slice(0, k) if self.side == "left" else slice(k, 2 * k)
         pressed = frame.pads.normal_n[mine] > 0.0
         contact = PadContact(penetration, _NODES[pressed], frame.pads.shear[mine][pressed])
-        return deform(contact, self.grid)
+        return deform(contact, self.grid, self.parameters)
 
     def image(self, deformation: GelDeformation, frame: FrameState) -> Image:
         """What its camera sees."""
@@ -78,7 +89,9 @@ def make_gels(spec: TrialSpec, T_E_S: dict[str, FloatArray], tool: ToolShape) ->
         rng = stream(spec.seed, "gel-left" if side == "left" else "gel-right")
         unit = int(rng.integers(2**31))
         drift = d.illumination_drift * float(rng.normal())
-        noise = CameraNoise(flicker=0.5 * d.illumination_drift, drift_per_minute=4.0 * drift)
+        noise = _camera_noise(
+            d.camera_noise, flicker=0.5 * d.illumination_drift, drift_per_minute=4.0 * drift
+        )
         renderer = TactileRenderer(
             _optics(d.optics, unit),
             layout,
@@ -88,13 +101,20 @@ def make_gels(spec: TrialSpec, T_E_S: dict[str, FloatArray], tool: ToolShape) ->
             shown_fraction=d.shown_shear,
             seed=unit,
         )
-        return Gel(side, T_E_S[side], tool, grid, renderer)
+        parameters = unseen_gel(unit) if d.gel_law == "unseen" else GelParameters()
+        return Gel(side, T_E_S[side], tool, grid, renderer, parameters)
 
     return {side: gel(side) for side in SIDES}
 
 
 def _optics(kind: str, unit: int) -> Optics:
-    return unseen_optics(unit) if kind == "unseen" else gel_optics(None)
+    return unseen_optics(unit) if kind == "unseen" else gel_optics(unit if kind == "standard" else None)
+
+
+def _camera_noise(share: float, flicker: float, drift_per_minute: float) -> CameraNoise:
+    full = CameraNoise()
+    b, g, r = (share * sigma for sigma in full.sigma_bgr)
+    return CameraNoise((b, g, r), share * full.fixed_pattern, flicker, drift_per_minute)
 
 
 @dataclass(slots=True)

@@ -166,7 +166,9 @@ class Hand:
         fraction = travelled(t - s.start_s, s.duration_s - s.rest_s, ramp)
         T = self.T_B_E_start.copy()
         if s.anchoring:
-            motion = ANCHOR_MOTIONS[self.spec.anchor_motion if s.start_s == 0.0 else "two-axis"]  # no pit there
+            motion = ANCHOR_MOTIONS[
+                self.spec.anchor_motion if s.start_s == 0.0 else "two-axis"
+            ]  # no pit there
             w, d = motion.at(fraction)
             pivot_E = self.nominal_tip_E if motion.about_tip else self.pads_E
             pivot_B = T[:3, :3] @ pivot_E + T[:3, 3]

@@ -18,6 +18,7 @@ PADS_E = np.array([0.0, 0.0, 0.140])
 CALIBRATED_OPENING_M = 6.2e-3
 MM_PER_PX = 0.0625
 IMAGE_SIZE_PX = (320, 240)
+MARKER_THRESHOLD = (0.0, 50.0)  # the usual 70 also takes 16 % of the dot-free gel, its dark corners
 _ROOT_HALF = float(np.sqrt(0.5))
 _QUATERNION: dict[Side, tuple[float, float, float, float]] = {
     "left": (0.0, -_ROOT_HALF, 0.0, _ROOT_HALF),
@@ -35,6 +36,7 @@ def true_rig(spec: TrialSpec) -> Rig:
             image_size_px=IMAGE_SIZE_PX,
             mm_per_px=(MM_PER_PX, MM_PER_PX),
             T_E_S=Transform(translation_m=(x, 0.0, float(PADS_E[2])), quaternion_xyzw=_QUATERNION[side]),
+            marker_threshold=MARKER_THRESHOLD,
             marker_pitch_mm=round(spec.marker_pitch_m * 1e3, 6),
         )
 
