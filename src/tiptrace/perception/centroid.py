@@ -82,7 +82,9 @@ class DotMeter:
     def _windows(self, contrast: Windows, at: NDArray[np.intp]) -> Windows:
         padded = cv2.copyMakeBorder(contrast, *(4 * [self._reach]), borderType=cv2.BORDER_CONSTANT, value=0.0)
         k = np.arange(2 * self._reach + 1)
-        windows: Windows = padded[at[:, 1, None, None] + k[None, :, None], at[:, 0, None, None] + k[None, None, :]]
+        windows: Windows = padded[
+            at[:, 1, None, None] + k[None, :, None], at[:, 0, None, None] + k[None, None, :]
+        ]
         return windows
 
     def _centroid(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,12 +11,15 @@ from numpy.typing import NDArray
 from tiptrace.config import Sensor
 from tiptrace.errors import PerceptionError
 from tiptrace.perception.depth import DepthMap, PaperDepth
+from tiptrace.perception.full_depth import FullDepth
 from tiptrace.perception.gel_model import GelModel
-from tiptrace.perception.lifting import lift, sample_map
-from tiptrace.perception.markers import Markers, check_image, detect_markers
+from tiptrace.perception.lifters import FullLifter, Lifter, PaperLifter, PlanarLifter, rest_positions
+from tiptrace.perception.lifting import lift
+from tiptrace.perception.markers import Markers, check_image, check_pitch, detect_markers
+from tiptrace.perception.registration import RegisteredTracker
 from tiptrace.perception.settings import SensingConfig
 from tiptrace.perception.tracking import LucasKanadeTracker, MarkerTracker
-from tiptrace.types import FingerMarkers, Image, Side
+from tiptrace.types import BoolArray, FingerMarkers, FloatArray, Image, Side
 
 
 class Finger:
@@ -25,13 +27,13 @@ class Finger:
 
     Attributes:
         markers: The dots of the first image; None before it.
-        depth: The latest depth map with what is known about it; None before the first image.
+        depth: The latest depth map at image resolution; None before the first image and without a network.
     """
 
     def __init__(
         self,
         sensor: Sensor,
-        gel: GelModel,
+        gel: GelModel | None,
         reference: Image | None,
         config: SensingConfig | None = None,
         *,
@@ -41,25 +43,29 @@ class Finger:
 
         Args:
             sensor: What the rig says about it.
-            gel: Its calibrated network.
-            reference: Image of the untouched gel, (H, W, 3) uint8 BGR.
+            gel: Its calibrated network; None only with ``depth: none``.
+            reference: Image of the untouched gel, (H, W, 3) uint8 BGR; needed for depth.
             config: Settings of the chain.
             side: Which finger it is, for error messages.
 
         Raises:
-            PerceptionError: no reference, or one that cannot be used.
+            PerceptionError: no reference or network where depth is wanted, or a reference that cannot be used.
         """
         self._sensor, self._config = sensor, config or SensingConfig()
         self._name = "" if side is None else f"{side} finger: "
+        self._reference = reference
         self.markers: Markers | None = None
         self.depth: DepthMap | None = None
         self._tracker: MarkerTracker | None = None
+        self._lifter: Lifter | None = None
         with self._named():
+            if reference is not None:
+                check_image(reference, sensor.image_size_px)
             self._depth = self._depth_chain(gel, reference)
 
     @property
     def depth_m(self) -> NDArray[np.float32] | None:
-        """Latest depth map (H, W) m, positive = pressed in; None before the first image."""
+        """Latest depth map (H, W) m, positive = pressed in; None where there is none."""
         return None if self.depth is None else self.depth.depth_m
 
     def sense(self, image: Image) -> FingerMarkers:
@@ -69,30 +75,51 @@ class Finger:
             PerceptionError: another size than the rig says, black, overexposed, too few markers in the first.
         """
         with self._named():
-            return self._sense(image)
+            check_image(image, self._sensor.image_size_px)
+            uv_px, tracked = self._track(image)
+            assert self._lifter is not None
+            depths = self._lifter(image, uv_px, tracked)
+        self.depth = depths.map
+        x_S = lift(uv_px, depths.depth_m, self._sensor.image_size_px, self._sensor.metres_per_px)  # (n, 3)
+        return FingerMarkers(x_S=x_S, tracked=tracked, uv_px=uv_px, depth_sigma_m=depths.sigma_m)
 
-    def _sense(self, image: Image) -> FingerMarkers:
-        check_image(image, self._sensor.image_size_px)
-        if self._tracker is None:
-            self.markers = detect_markers(image)
-            self._tracker = LucasKanadeTracker(image, self.markers.uv_px)
-            uv_px, tracked = self.markers.uv_px.copy(), np.ones(len(self.markers), dtype=np.bool_)
+    def _track(self, image: Image) -> tuple[FloatArray, BoolArray]:
+        """Positions (n, 2), NaN where lost, and tracked (n,); the first image starts tracker and lifter."""
+        if self._tracker is not None:
+            return self._tracker.update(image)
+        markers = detect_markers(image)
+        check_pitch(markers, self._sensor.marker_pitch_mm, self._sensor.mm_per_px)
+        if self._config.method == "paper":
+            tracker: MarkerTracker = LucasKanadeTracker(image, markers.uv_px)
+            start = markers.uv_px
         else:
-            uv_px, tracked = self._tracker.update(image)
-        self.depth = self._depth(image)
-        h = sample_map(self.depth.depth_m, uv_px)  # (n,)
-        x_S = lift(uv_px, h, self._sensor.image_size_px, self._sensor.metres_per_px)  # (n, 3)
-        return FingerMarkers(x_S=x_S, tracked=tracked, uv_px=uv_px)
+            tracker = RegisteredTracker(image, markers)
+            start = tracker.start_px
+        self._lifter = self._make_lifter(image, markers, tracker)
+        self.markers, self._tracker = Markers(start, markers.diameter_px), tracker
+        return start.copy(), np.ones(len(markers), dtype=np.bool_)
 
-    def _depth_chain(self, gel: GelModel, reference: Image | None) -> DepthChain:
+    def _make_lifter(self, image: Image, markers: Markers, tracker: MarkerTracker) -> Lifter:
+        if isinstance(self._depth, PaperDepth):
+            return PaperLifter(self._depth)
+        if isinstance(self._depth, FullDepth) and isinstance(tracker, RegisteredTracker):
+            return FullLifter(self._depth, tracker, image, markers)
+        return PlanarLifter(rest_positions(markers, self._reference), self._config.indentation_m)
+
+    def _depth_chain(self, gel: GelModel | None, reference: Image | None) -> PaperDepth | FullDepth | None:
+        if self._config.depth == "none":
+            return None
         if reference is None:
             raise PerceptionError(
                 "no image of the untouched gel: depth is measured against one; add reference_left.png and "
                 "reference_right.png, or sense without depth (--depth none)"
             )
-        check_image(reference, self._sensor.image_size_px)
-        s_x, s_y = self._sensor.metres_per_px
-        return PaperDepth(gel, reference, (float(s_x), float(s_y)), self._sensor.marker_threshold)
+        if gel is None:
+            raise PerceptionError("no gel model: calibrate the gel, or sense without depth (--depth none)")
+        s_x, s_y = (float(s) for s in self._sensor.metres_per_px)
+        if self._config.method == "paper":
+            return PaperDepth(gel, reference, (s_x, s_y), self._sensor.marker_threshold)
+        return FullDepth(gel, reference, (s_x, s_y), self._config.depth_step)
 
     @contextmanager
     def _named(self) -> Iterator[None]:
@@ -103,11 +130,3 @@ class Finger:
             if not self._name:
                 raise
             raise PerceptionError(f"{self._name}{error}") from None
-
-
-class DepthChain(Protocol):
-    """Image to depth map."""
-
-    def __call__(self, image: Image) -> DepthMap:
-        """Depth of an image of the same size as the reference."""
-        ...

@@ -20,6 +20,7 @@ MIN_MARKERS = 11  # drop 3, keep 8 (paper, marker selection)
 _MAX_DIAMETER = 24.0 / 320.0  # of the image's width
 _MIN_DIAMETER_PX = 3.0
 _MIN_CONTRAST = 0.12  # of the local background
+_PITCH_TOLERANCE = 0.25
 _DARK, _BRIGHT = 12.0, 250.0  # mean grey level of a frame beyond which nothing can be seen
 
 Contrast = NDArray[np.float32]
@@ -103,6 +104,36 @@ def detect_markers(image: Image) -> Markers:
             "is this a marker gel, in focus and evenly lit?"
         )
     return markers
+
+
+def detect_cut_dots(image: Image) -> FloatArray:
+    """Centres (c, 2) px of the visible parts of dots that the image's border cuts."""
+    H, W = image.shape[:2]
+    centres = []
+    for outline in _dot_regions(dot_contrast(image), on_border=True):
+        u, v, w, h = cv2.boundingRect(outline)
+        if u <= 0 or v <= 0 or u + w >= W or v + h >= H:
+            centres.append((u + (w - 1) / 2, v + (h - 1) / 2))
+    return np.asarray(centres, dtype=np.float64).reshape(-1, 2)
+
+
+def check_pitch(markers: Markers, pitch_mm: float | None, mm_per_px: tuple[float, float]) -> None:
+    """Refuse a gel whose dots are not as far apart as the rig says.
+
+    Raises:
+        PerceptionError: the median distance to the nearest marker is off by more than a quarter.
+    """
+    if pitch_mm is None:
+        return
+    xy = markers.uv_px * np.asarray(mm_per_px)
+    distance = np.linalg.norm(xy[:, None] - xy[None], axis=2)
+    np.fill_diagonal(distance, np.inf)
+    seen = float(np.median(distance.min(axis=1)))
+    if abs(seen / pitch_mm - 1.0) > _PITCH_TOLERANCE:
+        raise PerceptionError(
+            f"markers are {seen:.2f} mm apart at mm_per_px = {mm_per_px[0]:g}, the rig says {pitch_mm:g} mm: "
+            "another gel is mounted, or mm_per_px belongs to another crop"
+        )
 
 
 def dot_mask(image: Image, margin_px: int = 2) -> BoolArray:

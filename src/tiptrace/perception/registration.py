@@ -48,6 +48,15 @@ class RegisteredTracker:
         """Positions (n, 2) in the first image."""
         return self._rest.copy()
 
+    @property
+    def mask_radius_px(self) -> float:
+        """Radius of the discs of :meth:`mask`."""
+        return self._meter.mask_radius_px
+
+    def mask(self, uv_px: FloatArray, shape: tuple[int, int]) -> BoolArray:
+        """Pixels (H, W) of dots at places (n, 2), with a margin."""
+        return self._meter.mask(uv_px, shape)
+
     def update(self, image: Image) -> tuple[FloatArray, BoolArray]:
         """Track into the next image: uv_px (n, 2), NaN where lost, and tracked (n,)."""
         grey = grey_image(image)
@@ -102,7 +111,12 @@ class RegisteredTracker:
         H, W = grey.shape
         for i in missing:
             u, v = np.round(guess[i]).astype(int)
-            u0, u1, v0, v1 = max(u - reach, 0), min(u + reach + 1, W), max(v - reach, 0), min(v + reach + 1, H)
+            u0, u1, v0, v1 = (
+                max(u - reach, 0),
+                min(u + reach + 1, W),
+                max(v - reach, 0),
+                min(v + reach + 1, H),
+            )
             if u1 - u0 < 3 or v1 - v0 < 3:
                 continue
             dark = np.unravel_index(int(np.argmin(smooth[v0:v1, u0:u1])), (v1 - v0, u1 - u0))

@@ -13,6 +13,7 @@ class SensingConfig(BaseModel):
     Attributes:
         method: ``paper`` is Sec. II-B to the letter; ``full`` tracks without drift and fills better.
         depth: ``network`` needs a calibrated gel; ``none`` measures in the gel's plane only.
+        indentation_m: With ``depth: none``: how deep the tool sits in each gel, (thickness − opening) / 2.
         depth_step: In ``full``, every how many pixels depth is computed (2 = half resolution).
     """
 
@@ -20,4 +21,5 @@ class SensingConfig(BaseModel):
 
     method: Literal["paper", "full"] = "full"
     depth: Literal["network", "none"] = "network"
+    indentation_m: float = Field(default=0.6e-3, gt=0, lt=5e-3)
     depth_step: int = Field(default=2, ge=1, le=4)

@@ -1,0 +1,123 @@
+"""Depth by the full method: masks from the dots, smooth continuation under them, lamps corrected.
+
+At a coarser step the network sees means over step × step pixels, which costs a quarter at step 2 and less noise.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tiptrace.perception.background import untouched_background
+from tiptrace.perception.depth import DepthMap, untouched_gel, zero_level
+from tiptrace.perception.fill import smooth_fill
+from tiptrace.perception.gel_model import GelModel
+from tiptrace.perception.illumination import LampGain, Level
+from tiptrace.perception.lifting import sample_map
+from tiptrace.perception.markers import check_image
+from tiptrace.perception.poisson import PoissonSolver
+from tiptrace.types import BoolArray, FloatArray, Image
+
+Float32Map = NDArray[np.float32]
+
+_RING = np.stack([np.cos(np.arange(8) * np.pi / 4), np.sin(np.arange(8) * np.pi / 4)], axis=1)  # (8, 2)
+_CALM = 0.02  # slope below which gel may tell about the lamps
+_NOISE_M = 4e-6  # of a marker's depth on flat gel
+_FILL_SHARE = 0.12  # of the slope's variation around a dot times its radius: error of the fill under it
+
+
+class FullDepth:
+    """Depth of one gel against its reference, at every ``step``-th pixel."""
+
+    def __init__(
+        self, gel: GelModel, reference: Image, metres_per_px: tuple[float, float], step: int = 2
+    ) -> None:
+        """Prepare with the image of the untouched gel, (H, W, 3) uint8 BGR.
+
+        Raises:
+            PerceptionError: an unusable reference.
+        """
+        check_image(reference)
+        H, W = reference.shape[:2]
+        self._gel, self._step = gel, step
+        self._s = float(np.mean(metres_per_px))
+        self._size = (W // step, H // step)
+        self._crop = (self._size[1] * step, self._size[0] * step)
+        shape = (self._size[1], self._size[0])
+        v, u = np.indices(shape, dtype=np.float32) * step + (step - 1) / 2
+        self._unit_uv = np.stack([u / W, v / H], axis=-1).reshape(-1, 2)
+        self._background = self._shrink(untouched_background(reference))
+        scale = (metres_per_px[0] * step, metres_per_px[1] * step)
+        self._solver = PoissonSolver(shape, scale)
+        self._level = Level(shape, scale)
+        self._lamps = LampGain(shape, self._network)
+        self._flat = self._network(np.ones_like(self._background))  # what the network says of untouched gel
+        self._calm: BoolArray | None = None
+        self._slopes: Float32Map = np.zeros((*shape, 2), dtype=np.float32)
+
+    def __call__(self, image: Image, dots: BoolArray) -> DepthMap:
+        """Depth of an image.
+
+        Args:
+            image: (H, W, 3) uint8 BGR, of the reference's size.
+            dots: (H, W) pixels of dots.
+        """
+        mask = self._shrink(dots.astype(np.float32)) > 0.0  # (h, w)
+        ratio = self._shrink(image.astype(np.float32)) / np.maximum(self._background, 1.0)
+        if self._calm is None:  # first frame: nobody has said yet where the gel is calm
+            self._measure(ratio, mask)
+        assert self._calm is not None
+        return self._measure(self._lamps.correct(ratio, self._calm & ~mask), mask)
+
+    def _measure(self, ratio: Float32Map, mask: BoolArray) -> DepthMap:
+        """Depth from a ratio image (h, w, 3) that lamps no longer disturb; remembers slopes and calm gel."""
+        self._slopes = smooth_fill(self._network(ratio) - self._flat, mask)  # (h, w, 2)
+        h = -self._solver.integrate(self._slopes[..., 0], self._slopes[..., 1])
+        untouched, visible = untouched_gel(h, self._slopes)
+        h = self._level.apply(h, untouched) if visible else h - zero_level(h, untouched, visible)
+        self._calm = untouched & (cv2.blur(np.abs(self._slopes).max(axis=2), (5, 5)) < _CALM)
+        return DepthMap(depth_m=h, untouched=untouched, zero_visible=visible)
+
+    def at(self, depth: DepthMap, uv_px: FloatArray) -> FloatArray:
+        """Depth (n,) m at image positions (n, 2)."""
+        return sample_map(depth.depth_m, uv_px, self._step)
+
+    def sigma_at(self, uv_px: FloatArray, radius_px: float) -> FloatArray:
+        """Standard deviation (n,) m of the depth under dots: noise, and what the fill cannot know.
+
+        The fill's error grows with how much the slope varies around the dot.
+        """
+        ring = radius_px + self._step
+        around = uv_px[:, None] + ring * _RING[None]  # (n, 8, 2)
+        flat = around.reshape(-1, 2)
+        samples = [sample_map(self._slopes[..., c], flat, self._step).reshape(-1, len(_RING)) for c in (0, 1)]
+        variation = np.sqrt(sum(np.var(s, axis=1) for s in samples))  # (n,) m/m
+        return np.asarray(np.hypot(_NOISE_M, _FILL_SHARE * variation * radius_px * self._s))
+
+    def at_image_size(self, depth: DepthMap, shape: tuple[int, int]) -> DepthMap:
+        """The map at image resolution (H, W)."""
+        if depth.depth_m.shape == shape:
+            return depth
+        size = (self._crop[1], self._crop[0])
+        border = (0, shape[0] - self._crop[0], 0, shape[1] - self._crop[1])
+        full = cv2.resize(depth.depth_m, size, interpolation=cv2.INTER_LINEAR)
+        open_ = cv2.resize(depth.untouched.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+        full, open_ = (cv2.copyMakeBorder(m, *border, borderType=cv2.BORDER_REPLICATE) for m in (full, open_))
+        return DepthMap(
+            np.asarray(full, dtype=np.float32), np.asarray(open_, dtype=np.bool_), depth.zero_visible
+        )
+
+    def _network(self, ratio: Float32Map) -> Float32Map:
+        colours = ratio - 1.0 if self._gel.convention.background == "ratio" else ratio * self._background
+        slopes = self._gel.slopes(
+            np.ascontiguousarray(colours.reshape(-1, 3), dtype=np.float32), self._unit_uv
+        )
+        return slopes.reshape(*ratio.shape[:2], 2)
+
+    def _shrink(self, image: Float32Map) -> Float32Map:
+        """Means over step × step pixels."""
+        cropped = image[: self._crop[0], : self._crop[1]]
+        if self._step == 1:
+            return cropped
+        return np.asarray(cv2.resize(cropped, self._size, interpolation=cv2.INTER_AREA), dtype=np.float32)
