@@ -80,6 +80,7 @@ def evaluate(
 
     from tiptrace.errors import ConfigError
     from tiptrace.evaluation.suite_store import SuiteStore
+    from tiptrace.evaluation.versions import library_versions
     from tiptrace.trial_plan import recording_tasks, suite_tasks
 
     names = [m.strip() for m in methods.split(",") if m.strip()]
@@ -98,13 +99,12 @@ def evaluate(
         tasks, notes = recording_tasks(paths or [], truth, analytic, _start(start), options)
         for note in notes:
             console.print(f"note: {note}", highlight=False, markup=False)
-    store.claim(settings)
+    store.claim({**settings, "tiptrace": library_versions().get("tiptrace", "")})
     workers = workers or os.cpu_count() or 1
     records = _run(tasks, names, store, workers, scheduler)
     records = _report_outliers(tasks, names, store, records)
     found = _run_budget(level, seed, budget, names, store, workers, scheduler)
-    page = _report(store, records, found, settings, suite)
-    _show(console, records, page)
+    _show(console, records, _report(store, records, found, settings, suite))
     if any(r.failure for r in records):
         raise typer.Exit(1)
 
