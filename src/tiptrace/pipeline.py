@@ -122,6 +122,8 @@ def _finish(trajectory: TipTrajectory, tracer: TipTracer) -> TipTrajectory:
             "no pair of left and right images with an end-effector pose: the streams do not overlap in time, or "
             "one of them is empty; `tiptrace inspect` shows their intervals"
         )
+    if any(estimate.p_B is not None for estimate in trajectory.estimates):
+        return trajectory
     phases = {estimate.phase for estimate in trajectory.estimates}
     if phases == {None}:
         raise RecordingError(

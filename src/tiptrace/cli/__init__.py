@@ -11,6 +11,7 @@ from rich.markup import escape
 import tiptrace
 from tiptrace.cli.calibrate_tip import calibrate_tip
 from tiptrace.cli.demo import demo
+from tiptrace.cli.evaluate import evaluate
 from tiptrace.cli.inspect import inspect
 from tiptrace.cli.reconstruct import reconstruct
 from tiptrace.cli.simulate import simulate
@@ -30,6 +31,7 @@ app.command()(demo)
 app.command()(simulate)
 app.command()(reconstruct)
 app.command()(inspect)
+app.command()(evaluate)
 app.command()(surface)
 calibrate.command("tip")(calibrate_tip)
 
