@@ -69,8 +69,8 @@ def simulate(spec: TrialSpec) -> Trial:
     )
 
 
-def trial(spec: TrialSpec, cache: Path | None) -> Trial:
-    """From the cache, else simulated."""
+def trial(spec: TrialSpec, cache: Path | None, simulate_missing: bool = True) -> Trial | None:
+    """From the cache, else simulated; None where it is neither."""
     if cache is None:
         return simulate(spec)
     d = spec.disturbances is not None or spec.lifts or spec.pushes or spec.friction_drops or spec.dwells
@@ -80,6 +80,8 @@ def trial(spec: TrialSpec, cache: Path | None) -> Trial:
     path = cache / name
     if path.exists():
         return pickle.loads(path.read_bytes())  # our own file
+    if not simulate_missing:
+        return None
     result = simulate(spec)
     cache.mkdir(parents=True, exist_ok=True)
     path.with_suffix(".part").write_bytes(pickle.dumps(result))

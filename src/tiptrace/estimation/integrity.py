@@ -16,6 +16,7 @@ from tiptrace.estimation.motion import Motions
 from tiptrace.types import BoolArray, FloatArray
 
 _BEFORE, _AFTER = 10, 4  # frames compared for a slip
+_STILL = 10  # frames over which a tool in the air hangs still
 
 
 class IntegrityConfig(BaseModel):
@@ -37,7 +38,9 @@ class IntegrityConfig(BaseModel):
     twist_frames: int = Field(default=3, ge=1)
     # the tool springs out along its axis when the tip lifts off
     release_m: float = Field(default=4.5e-4, gt=0)
-    contact_frames: int = Field(default=2, ge=1)
+    still_axial_m: float = Field(default=1.0e-4, gt=0)
+    still_across_m: float = Field(default=1.5e-4, gt=0)
+    regain_m: float = Field(default=2e-4, gt=0)
     pose_gap_s: float = Field(default=0.1, gt=0)
 
 
@@ -103,8 +106,9 @@ class Monitor:
         self._last_residual: FloatArray | None = None
         self._same = np.zeros(2, dtype=int)
         self._recent: deque[tuple[float, FloatArray]] = deque(maxlen=_BEFORE + _AFTER)  # χ², D
-        self._away = self._twisted = 0
-        self._contact = True
+        self._path: deque[FloatArray] = deque(maxlen=_STILL)
+        self._twisted = 0
+        self._contact, self._free_m = True, 0.0
 
     def repeated(self, x_S: FloatArray, pad: FloatArray) -> tuple[bool, bool]:
         """Whether each finger's frame equals the last one; call once per frame, first."""
@@ -145,7 +149,7 @@ class Monitor:
         c = self._config
         D = motions.R[0] @ c_E + motions.t[0] - c_E
         axial = float(D @ ref.axis_E)
-        self._judge_contact(axial, ref)
+        self._judge_contact(D, ref)
         slipping = self._slipped(float(motions.chi2[0]), D)
         limit = max(c.twist_limit_rad, 6.0 * ref.twist_spread_rad)
         twisted = abs(twist_rad - ref.twist_rad) > limit
@@ -177,13 +181,30 @@ class Monitor:
             self._recent.clear()  # the level after the slip is the new one
         return bool(alone or with_jump)
 
-    def _judge_contact(self, axial_m: float, ref: Reference) -> None:
-        """The preload holds the tool back; without contact it springs out by the preload over the stiffness."""
-        limit = ref.axial_m[1] + self._config.release_m * (1.0 if self._contact else 0.6)
-        away = axial_m > limit
-        self._away = self._away + 1 if away == self._contact else 0
-        if self._away >= self._config.contact_frames:
-            self._contact, self._away = not self._contact, 0
+    def _judge_contact(self, D: FloatArray, ref: Reference) -> None:
+        """In the air the tool has sprung out along its axis and hangs still in the grasp while the hand moves on.
+
+        Either alone is not enough: friction on a tilted tool pulls it out as well, and on a straight path it is
+        still. Judged over ten frames; shorter losses are not told.
+        """
+        self._path.append(D)
+        axial = float(D @ ref.axis_E)
+        c = self._config
+        if not self._contact:
+            self._contact = abs(axial - self._free_m) > c.regain_m
+            if self._contact:
+                self._path.clear()
+            return
+        if len(self._path) < _STILL:
+            return
+        path = np.stack(self._path)
+        along = path @ ref.axis_E  # (10,)
+        across = path - np.outer(along, ref.axis_E)
+        thirds = np.stack([across[:3].mean(axis=0), across[3:7].mean(axis=0), across[7:].mean(axis=0)])
+        swing = float(np.linalg.norm(thirds - thirds.mean(axis=0), axis=1).max())
+        out = float(np.median(along)) > ref.axial_m[1] + c.release_m
+        if out and np.ptp(along) < c.still_axial_m and swing < c.still_across_m:
+            self._contact, self._free_m = False, float(np.median(along))
 
     def _jumped(self, residual_E: FloatArray) -> BoolArray:
         last, self._last_residual = self._last_residual, residual_E
