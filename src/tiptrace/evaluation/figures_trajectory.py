@@ -27,6 +27,12 @@ _STATUS_COLOUR = {
     Status.UNOBSERVABLE: style.BLACK,
 }
 _SNAP_RAD = np.deg2rad(3.0)
+_STRAY, _STRAY_M = (
+    0.1,
+    10e-3,
+)  # share of the trace's extent, and least distance, beyond which others are cut off
+_ERROR_SHOWN = 10.0  # times the main method's largest error, and
+_ERROR_SHOWN_MM = 15.0  # at least this much, are drawn of any method's
 
 
 def overlay_top(data: ReportData) -> Figure:
@@ -90,19 +96,22 @@ def error_over_time(data: ReportData) -> Figure:
     figure = style.new_figure(7.2, 5.0)
     total, cross, along = figure.subplots(3, 1, sharex=True)
     ceiling = 1.0
+    main_mm = error_series(data.main.trajectory, data.truth).total_mm
+    most_mm = max(_ERROR_SHOWN_MM, _ERROR_SHOWN * float(main_mm.max())) if len(main_mm) else np.inf
     for k, method in enumerate(data.methods):
         colour, dash = style.method_style(method.name, k)
         look = {"color": colour, "linestyle": dash, "label": method.name}
         every = error_series(method.trajectory, data.truth, phase=None)
         late = error_series(method.trajectory, data.truth)
         if len(late.total_mm):
-            ceiling = max(ceiling, 1.15 * float(late.total_mm.max()))
+            ceiling = max(ceiling, min(1.15 * float(late.total_mm.max()), most_mm))
         total.plot(*_gapped(data, method, every.rows, every.total_mm), **look)
         cross.plot(*_gapped(data, method, late.rows, late.cross_track_mm), **look)
         along.plot(*_gapped(data, method, late.rows, late.along_track_mm), **look)
     total.set(ylim=(0, ceiling), ylabel="error [mm]", title="Distance to the true tip at the same instant")
     cross.set(ylabel="across [mm]", title="Distance to the true path")
-    cross.set_ylim(bottom=0)
+    cross.set_ylim(0, min(cross.get_ylim()[1], most_mm))
+    along.set_ylim(max(along.get_ylim()[0], -most_mm), min(along.get_ylim()[1], most_mm))
     along.set(ylabel="along [mm]", title="Lead (+) or lag (−) along the true path", xlabel="time [s]")
     for ax in (total, cross, along):
         _shade_phases(ax, data)
@@ -154,7 +163,22 @@ class _Line:
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)) * 1e3)
 
 
-def _lines(data: ReportData) -> Iterable[_Line]:
+def _lines(data: ReportData) -> list[_Line]:
+    """Truth and methods; a method that strays far from the truth and the main one is cut off there."""
+    lines = list(_whole_lines(data))
+    near = np.concatenate([line.p_B for line in lines[:2]])
+    near = near[np.isfinite(near).all(axis=1)]
+    if len(near) == 0:
+        return lines
+    low, high = near.min(axis=0), near.max(axis=0)
+    margin = max(_STRAY * float((high - low).max()), _STRAY_M)
+    for line in lines[2:]:
+        outside = ((line.p_B < low - margin) | (line.p_B > high + margin)).any(axis=1)
+        line.p_B[outside] = np.nan
+    return lines
+
+
+def _whole_lines(data: ReportData) -> Iterable[_Line]:
     if data.truth is not None:
         stamps = [e.stamp_ns for e in data.main.trajectory.estimates if e.phase is Phase.RECONSTRUCTION]
         p_gt = data.truth.at(stamps)
@@ -175,7 +199,7 @@ def _view(data: ReportData) -> tuple[FloatArray, FloatArray, tuple[str, str]]:
 
     The first axis is the direction of travel in the plane; within 3° of x it is x itself.
     """
-    reference = next(iter(_lines(data))).p_B
+    reference = next(iter(_whole_lines(data))).p_B
     reference = reference[np.isfinite(reference).all(axis=1)]
     origin = reference[0] if len(reference) else np.zeros(3)
     if data.truth is not None:
