@@ -76,11 +76,11 @@ class DotMeter:
     def _contrast(self, image: Windows, uv: FloatArray) -> Windows:
         """1 − I/I_gel, (H, W), with I_gel continued under the dots."""
         gel = smooth_fill(image[..., None], self.mask(uv, image.shape[:2]))[..., 0]
-        contrast: Windows = 1.0 - image / np.maximum(gel, 1.0)
-        return contrast
+        return np.asarray(1.0 - image / np.maximum(gel, 1.0), dtype=np.float32)
 
     def _windows(self, contrast: Windows, at: NDArray[np.intp]) -> Windows:
-        padded = cv2.copyMakeBorder(contrast, *(4 * [self._reach]), borderType=cv2.BORDER_CONSTANT, value=0.0)
+        r = self._reach
+        padded = cv2.copyMakeBorder(contrast, r, r, r, r, cv2.BORDER_CONSTANT, value=0.0)
         k = np.arange(2 * self._reach + 1)
         windows: Windows = padded[
             at[:, 1, None, None] + k[None, :, None], at[:, 0, None, None] + k[None, None, :]

@@ -13,10 +13,11 @@ from tiptrace.errors import PerceptionError
 from tiptrace.perception.depth import DepthMap, PaperDepth
 from tiptrace.perception.full_depth import FullDepth
 from tiptrace.perception.gel_model import GelModel
-from tiptrace.perception.lifters import FullLifter, Lifter, PaperLifter, PlanarLifter, rest_positions
+from tiptrace.perception.lifters import FullLifter, Lifter, PaperLifter, PlanarLifter
 from tiptrace.perception.lifting import lift
 from tiptrace.perception.markers import Markers, check_image, check_pitch, detect_markers
 from tiptrace.perception.registration import RegisteredTracker
+from tiptrace.perception.seeding import seed
 from tiptrace.perception.settings import SensingConfig
 from tiptrace.perception.tracking import LucasKanadeTracker, MarkerTracker
 from tiptrace.types import BoolArray, FingerMarkers, FloatArray, Image, Side
@@ -87,24 +88,29 @@ class Finger:
         """Positions (n, 2), NaN where lost, and tracked (n,); the first image starts tracker and lifter."""
         if self._tracker is not None:
             return self._tracker.update(image)
-        markers = detect_markers(image)
-        check_pitch(markers, self._sensor.marker_pitch_mm, self._sensor.mm_per_px)
-        if self._config.method == "paper":
-            tracker: MarkerTracker = LucasKanadeTracker(image, markers.uv_px)
-            start = markers.uv_px
-        else:
-            tracker = RegisteredTracker(image, markers)
-            start = tracker.start_px
-        self._lifter = self._make_lifter(image, markers, tracker)
-        self.markers, self._tracker = Markers(start, markers.diameter_px), tracker
-        return start.copy(), np.ones(len(markers), dtype=np.bool_)
+        start = self._start_paper(image) if self._config.method == "paper" else self._start_full(image)
+        check_pitch(start, self._sensor.marker_pitch_mm, self._sensor.mm_per_px)
+        self.markers = start
+        return start.uv_px.copy(), np.ones(len(start), dtype=np.bool_)
 
-    def _make_lifter(self, image: Image, markers: Markers, tracker: MarkerTracker) -> Lifter:
+    def _start_paper(self, image: Image) -> Markers:
+        markers = detect_markers(image)
+        self._tracker = LucasKanadeTracker(image, markers.uv_px)
         if isinstance(self._depth, PaperDepth):
-            return PaperLifter(self._depth)
-        if isinstance(self._depth, FullDepth) and isinstance(tracker, RegisteredTracker):
-            return FullLifter(self._depth, tracker, image, markers)
-        return PlanarLifter(rest_positions(markers, self._reference), self._config.indentation_m)
+            self._lifter = PaperLifter(self._depth)
+        else:
+            self._lifter = PlanarLifter(markers.uv_px, self._config.indentation_m)
+        return markers
+
+    def _start_full(self, image: Image) -> Markers:
+        seeds = seed(image, self._reference)
+        tracker = RegisteredTracker(image, seeds.markers)
+        self._tracker = tracker
+        if isinstance(self._depth, FullDepth):
+            self._lifter = FullLifter(self._depth, tracker, seeds.ghosts)
+        else:
+            self._lifter = PlanarLifter(seeds.rest_px, self._config.indentation_m)
+        return Markers(tracker.start_px, seeds.markers.diameter_px)
 
     def _depth_chain(self, gel: GelModel | None, reference: Image | None) -> PaperDepth | FullDepth | None:
         if self._config.depth == "none":

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from tiptrace.perception.background import untouched_background
 from tiptrace.perception.depth import DepthMap, untouched_gel, zero_level
+from tiptrace.perception.dot_fill import DotFill
 from tiptrace.perception.fill import smooth_fill
 from tiptrace.perception.gel_model import GelModel
 from tiptrace.perception.illumination import LampGain, Level
@@ -48,36 +49,45 @@ class FullDepth:
         v, u = np.indices(shape, dtype=np.float32) * step + (step - 1) / 2
         self._unit_uv = np.stack([u / W, v / H], axis=-1).reshape(-1, 2)
         self._background = self._shrink(untouched_background(reference))
+        self._floor = np.maximum(self._background, np.float32(1.0))
         scale = (metres_per_px[0] * step, metres_per_px[1] * step)
         self._solver = PoissonSolver(shape, scale)
         self._level = Level(shape, scale)
+        self._dot_fill: DotFill | None = None
         self._lamps = LampGain(shape, self._network)
         self._flat = self._network(np.ones_like(self._background))  # what the network says of untouched gel
         self._calm: BoolArray | None = None
         self._slopes: Float32Map = np.zeros((*shape, 2), dtype=np.float32)
 
-    def __call__(self, image: Image, dots: BoolArray) -> DepthMap:
+    def __call__(self, image: Image, dots: BoolArray, uv_px: FloatArray) -> DepthMap:
         """Depth of an image.
 
         Args:
             image: (H, W, 3) uint8 BGR, of the reference's size.
             dots: (H, W) pixels of dots.
+            uv_px: (n, 2) centres of the dots.
         """
         mask = self._shrink(dots.astype(np.float32)) > 0.0  # (h, w)
-        ratio = self._shrink(image.astype(np.float32)) / np.maximum(self._background, 1.0)
+        ratio = np.asarray(self._shrink(image.astype(np.float32)) / self._floor, dtype=np.float32)
         if self._calm is None:  # first frame: nobody has said yet where the gel is calm
-            self._measure(ratio, mask)
+            self._measure(ratio, mask, uv_px)
         assert self._calm is not None
-        return self._measure(self._lamps.correct(ratio, self._calm & ~mask), mask)
+        return self._measure(self._lamps.correct(ratio, self._calm & ~mask), mask, uv_px)
 
-    def _measure(self, ratio: Float32Map, mask: BoolArray) -> DepthMap:
+    def _measure(self, ratio: Float32Map, mask: BoolArray, uv_px: FloatArray) -> DepthMap:
         """Depth from a ratio image (h, w, 3) that lamps no longer disturb; remembers slopes and calm gel."""
         self._slopes = smooth_fill(self._network(ratio) - self._flat, mask)  # (h, w, 2)
+        if self._dot_fill is not None:
+            self._dot_fill.apply(self._slopes, (uv_px - (self._step - 1) / 2) / self._step)
         h = -self._solver.integrate(self._slopes[..., 0], self._slopes[..., 1])
         untouched, visible = untouched_gel(h, self._slopes)
         h = self._level.apply(h, untouched) if visible else h - zero_level(h, untouched, visible)
         self._calm = untouched & (cv2.blur(np.abs(self._slopes).max(axis=2), (5, 5)) < _CALM)
         return DepthMap(depth_m=h, untouched=untouched, zero_visible=visible)
+
+    def expect_dots(self, radius_px: float) -> None:
+        """Say how large the masked discs of dots are."""
+        self._dot_fill = DotFill((self._size[1], self._size[0]), (radius_px + 0.75 * self._step) / self._step)
 
     def at(self, depth: DepthMap, uv_px: FloatArray) -> FloatArray:
         """Depth (n,) m at image positions (n, 2)."""

@@ -57,7 +57,7 @@ class LampGain:
             both = good & good_0
             if int(both.sum()) >= _LEAST_BLOCKS:
                 self.gain = self._gain_0 * np.median(means[both] / means_0[both], axis=0)
-        return ratio / self.gain.astype(np.float32)
+        return np.asarray(ratio / self.gain.astype(np.float32), dtype=np.float32)
 
     @staticmethod
     def _common_change(change: FloatArray, not_slope: FloatArray) -> float:
@@ -76,7 +76,9 @@ class LampGain:
         total = cv2.resize(ratio * weight[..., None], self._size, interpolation=cv2.INTER_AREA).reshape(-1, 3)
         return total / np.maximum(share, 1e-3)[:, None], np.asarray(share > 0.4)
 
-    def _directions(self, shape: tuple[int, int], slopes_of: Callable[[Float32Map], Float32Map]) -> FloatArray:
+    def _directions(
+        self, shape: tuple[int, int], slopes_of: Callable[[Float32Map], Float32Map]
+    ) -> FloatArray:
         """(b, 3) unit colour changes that move no slope, per block, for flat gel."""
         columns = []
         for c in range(3):
@@ -102,13 +104,13 @@ class Level:
 
     def apply(self, h: Float32Map, untouched: BoolArray) -> Float32Map:
         """Depth map (H, W) with untouched gel (H, W) at 0."""
-        constant, tilt = self._plane(h, untouched)
+        tilt = self._plane(h, untouched)
         self._tilt = tilt if self._tilt is None else self._tilt + _TILT_RATE * (tilt - self._tilt)
         z = h - self._tilt[0] * self._x[None, :] - self._tilt[1] * self._y[:, None]
         return np.asarray(z - np.median(z[untouched]), dtype=np.float32)
 
-    def _plane(self, h: Float32Map, untouched: BoolArray) -> tuple[float, FloatArray]:
-        """Robust plane; its tilt has a prior of zero, so that gel seen on one side only hardly tilts the rest."""
+    def _plane(self, h: Float32Map, untouched: BoolArray) -> FloatArray:
+        """Tilt (2,) of the robust plane, with a prior of zero: gel seen on one side only hardly tilts the rest."""
         v, u = np.nonzero(untouched[::2, ::2])
         z = h[::2, ::2][v, u].astype(np.float64)
         A = np.stack([np.ones(len(v)), self._x[2 * u], self._y[2 * v]], axis=1)  # (n, 3)
@@ -120,4 +122,4 @@ class Level:
             x = np.linalg.solve((A.T * w) @ A / len(v) + prior, (A.T * w) @ z / len(v))
             r = np.abs(z - A @ x)
             w = 1.0 / np.maximum(1.0, r / (2.0 * float(np.median(r)) + 1e-7))
-        return float(x[0]), x[1:]
+        return x[1:]
