@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable
 from typing import Any, Literal
 
 from tiptrace.config import Rig
-from tiptrace.errors import ConfigError, PerceptionError
+from tiptrace.errors import ConfigError
 from tiptrace.estimation.baselines import EeOracleEstimator, LocalAnchoringEstimator, NominalTipEstimator
 from tiptrace.estimation.ee_only import EeOnlyEstimator, Estimator
 from tiptrace.estimation.full import FullEstimator
@@ -67,10 +67,7 @@ class Sensing:
     def _sense(self, side: Side, observation: Observation) -> SensedFinger:
         seen = observation.finger(side)
         if isinstance(seen.sample, ImageSample):
-            try:
-                markers = self._finger(side).sense(seen.sample.image)
-            except PerceptionError as error:
-                raise PerceptionError(f"{side} finger: {error}") from error
+            markers = self._finger(side).sense(seen.sample.image)
         else:
             x_S = seen.sample.x_S
             markers = FingerMarkers(x_S=x_S, tracked=~(x_S != x_S).any(axis=1))
@@ -79,8 +76,10 @@ class Sensing:
     def _finger(self, side: Side) -> Finger:
         if side not in self.fingers:
             sensor = self._rig.sensor(side)
-            gel = load_gel_model(self._gel_models.get(sensor.gel_model, sensor.gel_model))
-            self.fingers[side] = Finger(sensor, gel, self._references.get(side), self._config)
+            gel = None
+            if self._config.depth == "network":
+                gel = load_gel_model(self._gel_models.get(sensor.gel_model, sensor.gel_model))
+            self.fingers[side] = Finger(sensor, gel, self._references.get(side), self._config, side=side)
         return self.fingers[side]
 
 

@@ -11,11 +11,13 @@ from rich.markup import escape
 import tiptrace
 from tiptrace.cli.calibrate_tip import calibrate_tip
 from tiptrace.cli.demo import demo
+from tiptrace.cli.depth import depth
 from tiptrace.cli.evaluate import evaluate
 from tiptrace.cli.inspect import inspect
 from tiptrace.cli.reconstruct import reconstruct
 from tiptrace.cli.simulate import simulate
 from tiptrace.cli.surface import surface
+from tiptrace.cli.track import track
 from tiptrace.errors import TipTraceError
 
 app = typer.Typer(
@@ -33,6 +35,8 @@ app.command()(reconstruct)
 app.command()(inspect)
 app.command()(evaluate)
 app.command()(surface)
+app.command()(track)
+app.command()(depth)
 calibrate.command("tip")(calibrate_tip)
 
 

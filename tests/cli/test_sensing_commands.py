@@ -1,0 +1,95 @@
+"""track and depth as a user runs them."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from tiptrace.cli.depth import depth
+from tiptrace.cli.track import track
+from tiptrace.errors import PerceptionError
+from tiptrace.sim.dots import DotLayout
+from tiptrace.sim.gel import untouched
+from tiptrace.sim.optics import gel_optics
+from tiptrace.sim.presses import render_press
+from tiptrace.sim.render import TactileRenderer
+
+
+@pytest.fixture(scope="module")
+def renderer() -> TactileRenderer:
+    return TactileRenderer(gel_optics(None), DotLayout(rows=7, columns=9), seed=1)
+
+
+@pytest.fixture(scope="module")
+def video(renderer: TactileRenderer, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("video") / "still.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 25, (320, 240))
+    for frame in range(5):
+        writer.write(renderer.render(untouched(), frame))
+    writer.release()
+    return path
+
+
+@pytest.mark.parametrize("method", ["full", "paper"])
+def test_track_writes_a_row_per_marker_and_frame_under_fixed_numbers(
+    video: Path, tmp_path: Path, method: str
+) -> None:
+    track(video, out=tmp_path / "tracks.csv", overlay=tmp_path / "tracks.mp4", method=method)  # type: ignore[arg-type]
+    with (tmp_path / "tracks.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert list(rows[0]) == ["frame", "marker", "u_px", "v_px", "status"]
+    assert len(rows) == 5 * 63
+    places = np.array([[float(r["u_px"]), float(r["v_px"])] for r in rows]).reshape(5, 63, 2)
+    assert np.abs(places - places[0]).max() < 0.3  # a still gel
+    assert cv2.VideoCapture(str(tmp_path / "tracks.mp4")).read()[0]
+
+
+def test_a_video_without_markers_or_no_video_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "blank.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 25, (320, 240))
+    writer.write(np.full((240, 320, 3), 120, dtype=np.uint8))
+    writer.release()
+    with pytest.raises(PerceptionError, match=r"blank\.avi: first frame: .*marker"):
+        track(path, out=tmp_path / "tracks.csv")
+    with pytest.raises(PerceptionError, match="cannot be read as a video"):
+        track(tmp_path / "none.avi", out=tmp_path / "tracks.csv")
+
+
+@pytest.mark.parametrize("method", ["full", "paper"])
+def test_depth_of_a_ball_press_is_metric_and_positive_inwards(
+    renderer: TactileRenderer, tmp_path: Path, method: str
+) -> None:
+    press = render_press(renderer, (160.0, 120.0), ball_diameter_m=6e-3, depth_m=0.6e-3)
+    cv2.imwrite(str(tmp_path / "press.png"), press.image)
+    cv2.imwrite(str(tmp_path / "reference.png"), renderer.reference())
+    depth(
+        tmp_path / "press.png",
+        reference=tmp_path / "reference.png",
+        gel="gelsight-mini-virtual",
+        mm_per_px=0.0625,
+        out=tmp_path,
+        method=method,  # type: ignore[arg-type]
+        marker_threshold=(0.0, 50.0),
+    )
+    h = np.load(tmp_path / "depth.npy")
+    assert h.shape == (240, 320)
+    assert h[110:130, 150:170].max() == pytest.approx(0.6e-3, rel=0.15)
+    assert abs(np.median(h[:40, :40])) < 5e-5
+    assert (tmp_path / "depth.png").stat().st_size > 10_000
+
+
+def test_image_and_reference_of_other_sizes_are_refused(renderer: TactileRenderer, tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "a.png"), renderer.reference())
+    cv2.imwrite(str(tmp_path / "b.png"), renderer.reference()[:200])
+    with pytest.raises(PerceptionError, match="differ in size"):
+        depth(
+            tmp_path / "a.png",
+            reference=tmp_path / "b.png",
+            gel="gelsight-mini-virtual",
+            mm_per_px=0.06,
+            out=tmp_path,
+        )
