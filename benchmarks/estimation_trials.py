@@ -62,7 +62,7 @@ def simulate(spec: TrialSpec) -> Trial:
     log = _Log()
     stream = SimulatedStream(spec, log)
     pairs = [sensed(o, stream.rig) for o in synchronise(stream)]
-    contact, t, deg, m = (np.array(column) for column in zip(*log.rows, strict=True))
+    contact, _, deg, m = (np.array(column) for column in zip(*log.rows, strict=True))
     exposure = np.array([s.stamp_ns for s in log.truth])
     return Trial(
         spec, stream.rig, stream.tool, pairs, Truth.from_samples(log.truth), contact, exposure, deg, m
