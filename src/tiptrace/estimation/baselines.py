@@ -84,18 +84,19 @@ class EeOracleEstimator:
 class LocalAnchoringEstimator:
     """``local-anchoring``: the paper's Stage I, solved anew in a sliding window all along the trial.
 
-    Directions that the window's motion leaves open are filled with the point of least norm about the pads.
+    A window without rotation says nothing; there the last estimate, carried by the tool's motion, fills in (ridge).
     """
 
-    def __init__(self, window: int = 25, open_below: float = 1e-2) -> None:
+    def __init__(self, window: int = 25, ridge_rad: float = 0.03) -> None:
         """Set the window.
 
         Args:
             window: Frames.
-            open_below: Singular values below this share of the largest one are cut off.
+            ridge_rad: Rotation in the window at which it counts as much as the last estimate.
         """
         self._window: deque[tuple[FloatArray, FloatArray]] = deque(maxlen=window)  # R_t (3, 3), d_t (3,)
-        self._open_below = open_below
+        self._ridge = ridge_rad**2
+        self._p_0: FloatArray | None = None  # last estimate, carried back to frame 0
         self._X_0: FloatArray | None = None
         self._use: FloatArray | None = None
         self._R_B_E_0: FloatArray = np.eye(3)
@@ -135,13 +136,17 @@ class LocalAnchoringEstimator:
         )
 
     def _fixed_point(self, middle: FloatArray) -> FloatArray:
-        """Least squares of ``(I − R_t R_0ᵀ)(p − middle) = …`` over the window, relative to its newest frame."""
+        """Least squares of ``(I − Q) p = e`` over the window, Q and e the motion from the newest frame to each."""
         R_now, d_now = self._window[-1]
-        A, b = [], []
-        for R, d in self._window:  # motion from now to then: x ↦ Q x + e
+        N, b = np.zeros((3, 3)), np.zeros(3)
+        for R, d in self._window:
             Q = R @ R_now.T
-            e = d - Q @ d_now
-            A.append(np.eye(3) - Q)
-            b.append(e - (np.eye(3) - Q) @ middle)
-        p, *_ = np.linalg.lstsq(np.concatenate(A), np.concatenate(b), rcond=self._open_below)
-        return np.asarray(middle + p)
+            A = np.eye(3) - Q
+            N += A.T @ A
+            b += A.T @ (d - Q @ d_now)
+        last = middle if self._p_0 is None else R_now @ self._p_0 + d_now
+        ridge = self._ridge * len(self._window) * (1e-4 if self._p_0 is None else 1.0)
+        p = np.linalg.solve(N + ridge * np.eye(3), b + ridge * last)
+        if len(self._window) == self._window.maxlen:
+            self._p_0 = R_now.T @ (p - d_now)
+        return np.asarray(p)

@@ -41,7 +41,8 @@ class TipMapConfig(BaseModel):
     latency_std_s: float = Field(default=0.030, gt=0)
     latency_gate_s: float = Field(default=0.010, gt=0)
     drift_sigma_m: float = Field(default=3e-3, gt=0)  # along the pads
-    drift_normal_sigma_m: float = Field(default=3e-4, gt=0)  # across them, where the tool cannot slip
+    drift_normal_sigma_m: float = Field(default=1e-4, gt=0)  # across them, where the tool cannot slip
+    hidden_drift: float = Field(default=0.3, ge=0)  # share of its σ that a drift without evidence still has
     drift_evidence: float = Field(default=3.0, gt=0)  # sigmas
     pose_sigma_m: float = Field(default=4e-5, gt=0)  # of the tip through the smoothed hand pose
     model_sigma_m: float = Field(default=1e-4, gt=0)  # what a linear map leaves
@@ -150,6 +151,8 @@ def solve_tip_map(
     sigma = np.sqrt(np.diag(along @ candidate.covariance[DRIFT, DRIFT] @ along.T))
     if np.any(np.abs(along @ candidate.drift) > config.drift_evidence * sigma):
         best = candidate
+    else:  # less drift than three sigmas may still be there
+        best.covariance[DRIFT, DRIFT] = config.hidden_drift**2 * candidate.covariance[DRIFT, DRIFT]
     return TipMap(
         best.theta, best.covariance, best.learned, best.rms, best.factor, len(phase), duration_s, best.r
     )
