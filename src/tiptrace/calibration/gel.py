@@ -13,6 +13,7 @@ from tiptrace.calibration.gel_data import Circle, PressFolder, read_press_folder
 from tiptrace.calibration.gel_evaluation import PressScore, measured_slopes, score_press
 from tiptrace.calibration.gel_network import HIDDEN, Progress, train_network
 from tiptrace.calibration.gel_onnx import mlp_to_onnx
+from tiptrace.calibration.gel_pictures import draw_press
 from tiptrace.calibration.gel_shading import Shading, fit_shading
 from tiptrace.perception.gel_model import Convention, GelModel
 from tiptrace.types import FloatArray
@@ -66,6 +67,7 @@ def train_gel(
     *,
     seed: int = 0,
     mm_per_px: tuple[float, float] | None = None,
+    pictures: Path | None = None,
     progress: Progress | None = None,
 ) -> GelTrainingReport:
     """Train a gel network on a folder of ball presses and write it as ONNX.
@@ -75,6 +77,7 @@ def train_gel(
         out: ONNX file to write.
         seed: Decides held-out presses, samples and initial weights.
         mm_per_px: Scale (x, y) of the images; None: the csv's, else 20 mm over the image's width.
+        pictures: Folder for a picture of each held-out press; None: none are drawn.
         progress: Called with a label and the share done.
 
     Raises:
@@ -98,6 +101,10 @@ def train_gel(
     out.write_bytes(mlp_to_onnx(network.weights, network.biases, convention, metadata=metadata))
     gel = GelModel(out.read_bytes(), str(out))
     scores = tuple(score_press(gel, data.presses[i], circles[i], data) for i in sorted(test))
+    if pictures is not None:
+        pictures.mkdir(parents=True, exist_ok=True)
+        for i, score in zip(sorted(test), scores, strict=True):
+            draw_press(score, data.presses[i], data, pictures / f"{Path(score.name).stem}.png")
     flat = measured_slopes(gel, data.reference, data.background, data.presses[0].dots)
     pitch = data.marker_pitch_px
     return GelTrainingReport(

@@ -17,7 +17,7 @@ from tiptrace.types import BoolArray, FloatArray
 
 _FLOOR = 0.15  # of the ink's contrast, below which a pixel counts as gel
 _ROUNDS = 3  # of recentring within a window
-_WINDOWS = 2  # a second one where the dot lies off the middle of the first
+_OFF_CENTRE_PX = 1.5  # a dot this far off the middle of its window gets another one
 
 Windows = NDArray[np.float32]
 
@@ -47,60 +47,70 @@ class DotMeter:
         self._core = max(0.28 * diameter_px, 1.0)
         self._reach = int(np.ceil(self._radius + 1.0))
         dv, du = np.mgrid[-self._reach : self._reach + 1, -self._reach : self._reach + 1]
-        self._dv, self._du = dv.astype(np.float32), du.astype(np.float32)
+        self._offsets = np.stack([np.ones(du.size), du.ravel(), dv.ravel()], axis=1).astype(
+            np.float32
+        )  # (k², 3)
 
     def measure(self, grey: NDArray[np.uint8], uv_px: FloatArray) -> DotMeasurement:
         """Centroids of the dots nearest to places (n, 2) px, which must be right to about half a dot."""
-        uv = np.array(uv_px, dtype=np.float64)
-        H, W = grey.shape
-        image = grey.astype(np.float32)
-        for _ in range(_WINDOWS):
-            at = np.clip(np.round(uv), 0, (W - 1, H - 1)).astype(np.intp)  # (n, 2)
-            contrast = self._contrast(image, uv)
-            windows = self._windows(contrast, at)  # (n, k, k)
-            for _ in range(_ROUNDS):
-                uv, ink, area = self._centroid(windows, at, uv)
-            if not len(uv) or np.abs(uv - at).max() < 1.5:
-                break
+        contrast = self._contrast(grey, uv_px)
+        uv, ink, area, at = self._centroids(contrast, uv_px)
+        off = np.flatnonzero(np.abs(uv - at).max(axis=1) > _OFF_CENTRE_PX)
+        if off.size:
+            uv[off], ink[off], area[off], _ = self._centroids(contrast, uv[off])
         return DotMeasurement(uv_px=uv, ink=ink, area_px=area)
 
-    def mask(self, uv_px: FloatArray, shape: tuple[int, int]) -> BoolArray:
-        """Pixels (H, W) of the dots at places (n, 2), with a margin."""
-        mask = np.zeros(shape, dtype=np.uint8)
-        for u, v in uv_px[np.isfinite(uv_px).all(axis=1)]:
-            cv2.circle(
-                mask, (round(u * 8), round(v * 8)), round(self.mask_radius_px * 8), 1, cv2.FILLED, shift=3
-            )
-        return np.asarray(mask, dtype=np.bool_)
+    def mask(self, uv_px: FloatArray, shape: tuple[int, int], step: int = 1) -> BoolArray:
+        """Pixels of the dots at places (n, 2), with a margin, in a map (H, W) that has every ``step``-th pixel."""
+        radius = self.mask_radius_px / step + 0.5
+        k = int(np.ceil(radius))
+        dv, du = np.mgrid[-k : k + 1, -k : k + 1]
+        disc = du**2 + dv**2 <= radius**2
+        H, W = shape
+        places = (uv_px[np.isfinite(uv_px).all(axis=1)] - (step - 1) / 2) / step
+        at = np.clip(np.round(places), (-k, -k), (W - 1 + k, H - 1 + k)).astype(np.intp) + k
+        padded = np.zeros((H + 2 * k, W + 2 * k), dtype=np.bool_)
+        stamp = (dv[disc] * (W + 2 * k) + du[disc])[None]
+        inside = (at >= k).all(axis=1) & (at[:, 0] < W + k) & (at[:, 1] < H + k)
+        at = np.where(inside[:, None], at, np.clip(at, (k, k), (W - 1 + k, H - 1 + k)))
+        padded.ravel()[(at[:, 1] * (W + 2 * k) + at[:, 0])[:, None] + stamp] = True
+        return padded[k : k + H, k : k + W]
 
-    def _contrast(self, image: Windows, uv: FloatArray) -> Windows:
+    def _contrast(self, grey: NDArray[np.uint8], uv: FloatArray) -> Windows:
         """1 − I/I_gel, (H, W), with I_gel continued under the dots."""
-        gel = smooth_fill(image[..., None], self.mask(uv, image.shape[:2]))[..., 0]
+        image = grey.astype(np.float32)
+        H, W = image.shape
+        gel = smooth_fill(image[..., None], self.mask(uv, (H, W)))[..., 0]
         return np.asarray(1.0 - image / np.maximum(gel, 1.0), dtype=np.float32)
 
+    def _centroids(
+        self, contrast: Windows, uv_px: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray, NDArray[np.intp]]:
+        """Centroids (n, 2), ink (n,), area (n,), and the middles of the windows used (n, 2)."""
+        H, W = contrast.shape
+        at = np.clip(np.round(uv_px), 0, (W - 1, H - 1)).astype(np.intp)  # (n, 2)
+        windows = self._windows(contrast, at)  # (n, k²)
+        uv = np.array(uv_px, dtype=np.float64)
+        du, dv = self._offsets[:, 1], self._offsets[:, 2]
+        for _ in range(_ROUNDS):
+            c = (uv - at).astype(np.float32)
+            rho = np.sqrt((du[None] - c[:, :1]) ** 2 + (dv[None] - c[:, 1:]) ** 2)
+            core = rho <= self._core
+            ink = np.einsum("nk,nk->n", windows, core.astype(np.float32)) / np.maximum(core.sum(axis=1), 1)
+            share = windows * (1.0 / np.maximum(ink, 0.05) / (1.0 - _FLOOR))[:, None].astype(np.float32)
+            weight = np.clip(share - np.float32(_FLOOR / (1.0 - _FLOOR)), 0.0, 1.0)
+            weight[core] = 1.0  # glints
+            weight *= np.clip(np.float32(self._radius + 0.5) - rho, 0.0, 1.0)
+            moments = (weight @ self._offsets).astype(np.float64)  # (n, 3): area, Σ w du, Σ w dv
+            area = np.maximum(moments[:, 0], 1e-3)
+            uv = at + moments[:, 1:] / area[:, None]
+        return uv, ink.astype(np.float64), area, at
+
     def _windows(self, contrast: Windows, at: NDArray[np.intp]) -> Windows:
+        """Contrast around integer places (n, 2), (n, k²); 0 outside the image."""
         r = self._reach
         padded = cv2.copyMakeBorder(contrast, r, r, r, r, cv2.BORDER_CONSTANT, value=0.0)
-        k = np.arange(2 * self._reach + 1)
-        windows: Windows = padded[
-            at[:, 1, None, None] + k[None, :, None], at[:, 0, None, None] + k[None, None, :]
-        ]
-        return windows
-
-    def _centroid(
-        self, contrast: Windows, at: NDArray[np.intp], uv: FloatArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        offset = (uv - at).astype(np.float32)  # (n, 2)
-        du = self._du[None] - offset[:, 0, None, None]
-        dv = self._dv[None] - offset[:, 1, None, None]
-        rho = np.sqrt(du * du + dv * dv)
-        core = rho <= self._core
-        ink = np.sum(contrast * core, axis=(1, 2)) / np.maximum(core.sum(axis=(1, 2)), 1)
-        share = contrast / np.maximum(ink, 0.05)[:, None, None]
-        weight = np.clip((share - _FLOOR) / (1.0 - _FLOOR), 0.0, 1.0)
-        weight[core] = 1.0  # glints
-        weight *= np.clip(self._radius + 0.5 - rho, 0.0, 1.0)
-        area = np.maximum(weight.sum(axis=(1, 2)), 1e-3)
-        shift = np.stack([np.sum(weight * du, axis=(1, 2)), np.sum(weight * dv, axis=(1, 2))], axis=1)
-        moved = uv + (shift / area[:, None]).astype(np.float64)
-        return moved, ink.astype(np.float64), area.astype(np.float64)
+        width = padded.shape[1]
+        stamp = (self._offsets[:, 2] + r) * width + self._offsets[:, 1] + r
+        index = (at[:, 1] * width + at[:, 0])[:, None] + stamp.astype(np.intp)[None]
+        return np.asarray(padded.ravel()[index], dtype=np.float32)

@@ -41,6 +41,24 @@ class DepthMap:
     zero_visible: bool
 
 
+def at_image_size(depth: DepthMap, shape: tuple[int, int]) -> DepthMap:
+    """A map made at a coarser step, enlarged to image resolution (H, W)."""
+    h, w = depth.depth_m.shape
+    H, W = shape
+    step = H // h
+    if step == 1:
+        return depth
+    size, border = (w * step, h * step), (0, H - h * step, 0, W - w * step)
+    fine = cv2.resize(depth.depth_m, size, interpolation=cv2.INTER_LINEAR)
+    untouched = cv2.resize(depth.untouched.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+    fine, untouched = (
+        cv2.copyMakeBorder(m, *border, borderType=cv2.BORDER_REPLICATE) for m in (fine, untouched)
+    )
+    return DepthMap(
+        np.asarray(fine, dtype=np.float32), np.asarray(untouched, dtype=np.bool_), depth.zero_visible
+    )
+
+
 class PaperDepth:
     """The paper's depth chain at full resolution, against one reference image."""
 
@@ -108,7 +126,7 @@ def untouched_gel(h: Float32Map, slope_change: Float32Map) -> tuple[BoolArray, b
     """
     smooth = cv2.GaussianBlur(slope_change, (0, 0), max(h.shape[1] / 160.0, 1.0))
     flat = np.hypot(smooth[..., 0], smooth[..., 1]) < _FLAT
-    lowest, deepest = np.percentile(h, (5, 99))
+    lowest, deepest = np.percentile(h[::2, ::2], (5, 99))
     untouched = flat & (h < lowest + max(_SHALLOW * (deepest - lowest), _SHALLOW_M))
     return np.asarray(untouched, dtype=np.bool_), bool(untouched.mean() >= _VISIBLE)
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from tiptrace.config import Sensor
 from tiptrace.errors import PerceptionError
-from tiptrace.perception.depth import DepthMap, PaperDepth
+from tiptrace.perception.depth import DepthMap, PaperDepth, at_image_size
 from tiptrace.perception.full_depth import FullDepth
 from tiptrace.perception.gel_model import GelModel
 from tiptrace.perception.lifters import FullLifter, Lifter, PaperLifter, PlanarLifter
@@ -28,7 +28,6 @@ class Finger:
 
     Attributes:
         markers: The dots of the first image; None before it.
-        depth: The latest depth map at image resolution; None before the first image and without a network.
     """
 
     def __init__(
@@ -56,7 +55,7 @@ class Finger:
         self._name = "" if side is None else f"{side} finger: "
         self._reference = reference
         self.markers: Markers | None = None
-        self.depth: DepthMap | None = None
+        self._map: DepthMap | None = None
         self._tracker: MarkerTracker | None = None
         self._lifter: Lifter | None = None
         with self._named():
@@ -65,9 +64,16 @@ class Finger:
             self._depth = self._depth_chain(gel, reference)
 
     @property
+    def depth(self) -> DepthMap | None:
+        """Latest depth map at image resolution; None before the first image and without a network."""
+        W, H = self._sensor.image_size_px
+        return None if self._map is None else at_image_size(self._map, (H, W))
+
+    @property
     def depth_m(self) -> NDArray[np.float32] | None:
         """Latest depth map (H, W) m, positive = pressed in; None where there is none."""
-        return None if self.depth is None else self.depth.depth_m
+        depth = self.depth
+        return None if depth is None else depth.depth_m
 
     def sense(self, image: Image) -> FingerMarkers:
         """Markers of the next image, (H, W, 3) uint8 BGR, lifted to F_S.
@@ -80,7 +86,7 @@ class Finger:
             uv_px, tracked = self._track(image)
             assert self._lifter is not None
             depths = self._lifter(image, uv_px, tracked)
-        self.depth = depths.map
+        self._map = depths.map
         x_S = lift(uv_px, depths.depth_m, self._sensor.image_size_px, self._sensor.metres_per_px)  # (n, 3)
         return FingerMarkers(x_S=x_S, tracked=tracked, uv_px=uv_px, depth_sigma_m=depths.sigma_m)
 

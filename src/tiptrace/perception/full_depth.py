@@ -24,12 +24,13 @@ Float32Map = NDArray[np.float32]
 
 _RING = np.stack([np.cos(np.arange(8) * np.pi / 4), np.sin(np.arange(8) * np.pi / 4)], axis=1)  # (8, 2)
 _CALM = 0.02  # slope below which gel may tell about the lamps
-_NOISE_M = 4e-6  # of a marker's depth on flat gel
-_FILL_SHARE = 0.12  # of the slope's variation around a dot times its radius: error of the fill under it
+_NOISE_M = 12e-6  # of a marker's depth, wherever it lies
+_DEPTH_SHARE = 0.03  # of the depth: what a network errs by in scale on another gel of the same make
+_FILL_SHARE = 0.3  # of the slope's variation around a dot times its radius: error of the fill under it
 
 
 class FullDepth:
-    """Depth of one gel against its reference, at every ``step``-th pixel."""
+    """Depth of one gel against its reference, at every ``step``-th pixel: maps of ``shape`` (h, w)."""
 
     def __init__(
         self, gel: GelModel, reference: Image, metres_per_px: tuple[float, float], step: int = 2
@@ -41,11 +42,11 @@ class FullDepth:
         """
         check_image(reference)
         H, W = reference.shape[:2]
-        self._gel, self._step = gel, step
+        self._gel, self.step = gel, step
         self._s = float(np.mean(metres_per_px))
         self._size = (W // step, H // step)
         self._crop = (self._size[1] * step, self._size[0] * step)
-        shape = (self._size[1], self._size[0])
+        self.shape = shape = (self._size[1], self._size[0])
         v, u = np.indices(shape, dtype=np.float32) * step + (step - 1) / 2
         self._unit_uv = np.stack([u / W, v / H], axis=-1).reshape(-1, 2)
         self._background = self._shrink(untouched_background(reference))
@@ -59,15 +60,14 @@ class FullDepth:
         self._calm: BoolArray | None = None
         self._slopes: Float32Map = np.zeros((*shape, 2), dtype=np.float32)
 
-    def __call__(self, image: Image, dots: BoolArray, uv_px: FloatArray) -> DepthMap:
-        """Depth of an image.
+    def __call__(self, image: Image, mask: BoolArray, uv_px: FloatArray) -> DepthMap:
+        """Depth of an image, (h, w).
 
         Args:
             image: (H, W, 3) uint8 BGR, of the reference's size.
-            dots: (H, W) pixels of dots.
+            mask: Map pixels, (h, w) of :attr:`shape`, that the network must not look at.
             uv_px: (n, 2) centres of the dots.
         """
-        mask = self._shrink(dots.astype(np.float32)) > 0.0  # (h, w)
         ratio = np.asarray(self._shrink(image.astype(np.float32)) / self._floor, dtype=np.float32)
         if self._calm is None:  # first frame: nobody has said yet where the gel is calm
             self._measure(ratio, mask, uv_px)
@@ -78,45 +78,34 @@ class FullDepth:
         """Depth from a ratio image (h, w, 3) that lamps no longer disturb; remembers slopes and calm gel."""
         self._slopes = smooth_fill(self._network(ratio) - self._flat, mask)  # (h, w, 2)
         if self._dot_fill is not None:
-            self._dot_fill.apply(self._slopes, (uv_px - (self._step - 1) / 2) / self._step)
+            self._dot_fill.apply(self._slopes, (uv_px - (self.step - 1) / 2) / self.step)
         h = -self._solver.integrate(self._slopes[..., 0], self._slopes[..., 1])
         untouched, visible = untouched_gel(h, self._slopes)
         h = self._level.apply(h, untouched) if visible else h - zero_level(h, untouched, visible)
-        self._calm = untouched & (cv2.blur(np.abs(self._slopes).max(axis=2), (5, 5)) < _CALM)
+        steepness = np.maximum(np.abs(self._slopes[..., 0]), np.abs(self._slopes[..., 1]))
+        self._calm = untouched & (cv2.blur(steepness, (5, 5)) < _CALM)
         return DepthMap(depth_m=h, untouched=untouched, zero_visible=visible)
 
     def expect_dots(self, radius_px: float) -> None:
         """Say how large the masked discs of dots are."""
-        self._dot_fill = DotFill((self._size[1], self._size[0]), (radius_px + 0.75 * self._step) / self._step)
+        self._dot_fill = DotFill(self.shape, (radius_px + 0.75 * self.step) / self.step)
 
     def at(self, depth: DepthMap, uv_px: FloatArray) -> FloatArray:
         """Depth (n,) m at image positions (n, 2)."""
-        return sample_map(depth.depth_m, uv_px, self._step)
+        return sample_map(depth.depth_m, uv_px, self.step)
 
-    def sigma_at(self, uv_px: FloatArray, radius_px: float) -> FloatArray:
-        """Standard deviation (n,) m of the depth under dots: noise, and what the fill cannot know.
+    def sigma_at(self, uv_px: FloatArray, depth_m: FloatArray, radius_px: float) -> FloatArray:
+        """Standard deviation (n,) m of depths (n,) under dots: noise, scale, and what the fill cannot know.
 
         The fill's error grows with how much the slope varies around the dot.
         """
-        ring = radius_px + self._step
+        ring = radius_px + self.step
         around = uv_px[:, None] + ring * _RING[None]  # (n, 8, 2)
         flat = around.reshape(-1, 2)
-        samples = [sample_map(self._slopes[..., c], flat, self._step).reshape(-1, len(_RING)) for c in (0, 1)]
+        samples = [sample_map(self._slopes[..., c], flat, self.step).reshape(-1, len(_RING)) for c in (0, 1)]
         variation = np.sqrt(sum(np.var(s, axis=1) for s in samples))  # (n,) m/m
-        return np.asarray(np.hypot(_NOISE_M, _FILL_SHARE * variation * radius_px * self._s))
-
-    def at_image_size(self, depth: DepthMap, shape: tuple[int, int]) -> DepthMap:
-        """The map at image resolution (H, W)."""
-        if depth.depth_m.shape == shape:
-            return depth
-        size = (self._crop[1], self._crop[0])
-        border = (0, shape[0] - self._crop[0], 0, shape[1] - self._crop[1])
-        full = cv2.resize(depth.depth_m, size, interpolation=cv2.INTER_LINEAR)
-        open_ = cv2.resize(depth.untouched.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
-        full, open_ = (cv2.copyMakeBorder(m, *border, borderType=cv2.BORDER_REPLICATE) for m in (full, open_))
-        return DepthMap(
-            np.asarray(full, dtype=np.float32), np.asarray(open_, dtype=np.bool_), depth.zero_visible
-        )
+        fill = _FILL_SHARE * variation * radius_px * self._s
+        return np.asarray(np.sqrt(_NOISE_M**2 + (_DEPTH_SHARE * depth_m) ** 2 + fill**2))
 
     def _network(self, ratio: Float32Map) -> Float32Map:
         colours = ratio - 1.0 if self._gel.convention.background == "ratio" else ratio * self._background
@@ -128,6 +117,6 @@ class FullDepth:
     def _shrink(self, image: Float32Map) -> Float32Map:
         """Means over step × step pixels."""
         cropped = image[: self._crop[0], : self._crop[1]]
-        if self._step == 1:
+        if self.step == 1:
             return cropped
         return np.asarray(cv2.resize(cropped, self._size, interpolation=cv2.INTER_AREA), dtype=np.float32)

@@ -145,11 +145,13 @@ class GelModel:
         elif self.convention.output == "angles":
             slopes = np.tan(np.clip(out, -1.33, 1.33))
         else:
-            n_z = np.sqrt(np.maximum(1.0 - np.sum(out * out, axis=1, keepdims=True), np.float32(0.05)))
-            slopes = -out / n_z  # (n, 2)
+            n_z2 = np.float32(1.0) - out[:, 0] * out[:, 0] - out[:, 1] * out[:, 1]
+            slopes = np.asarray(-out / np.sqrt(np.maximum(n_z2, 0.05))[:, None], dtype=np.float32)  # (n, 2)
         if self.convention.z_axis == "in":
             slopes = -slopes
-        bounded: Float32Array = np.clip(np.nan_to_num(slopes, nan=0.0), -MAX_SLOPE, MAX_SLOPE)
+        if not np.isfinite(slopes.sum()):
+            slopes = np.nan_to_num(slopes, nan=0.0)
+        bounded: Float32Array = np.clip(slopes, -MAX_SLOPE, MAX_SLOPE)
         return bounded
 
 

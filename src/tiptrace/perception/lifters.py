@@ -25,7 +25,7 @@ class MarkerDepths:
     Attributes:
         depth_m: (n,) positive = pressed in, NaN where lost.
         sigma_m: (n,) its standard deviation; None where the way gives none.
-        map: The depth map that it comes from, at image resolution; None without one.
+        map: The depth map that it comes from, at the step of the chain; None without one.
     """
 
     depth_m: FloatArray
@@ -66,10 +66,11 @@ class FullLifter:
         """Depth of markers at uv_px (n, 2) in an image."""
         at = self._tracker.expected_px
         everywhere = np.concatenate([at, self._ghosts.at(at)])
-        depth = self._depth(image, self._tracker.mask(everywhere, image.shape[:2]), everywhere)
+        mask = self._tracker.mask(everywhere, self._depth.shape, self._depth.step)
+        depth = self._depth(image, mask, everywhere)
         h = np.where(tracked, self._depth.at(depth, at), np.nan)
-        sigma = np.where(tracked, self._depth.sigma_at(at, self._radius), np.nan)
-        return MarkerDepths(h, sigma, self._depth.at_image_size(depth, image.shape[:2]))
+        sigma = np.where(tracked, self._depth.sigma_at(at, h, self._radius), np.nan)
+        return MarkerDepths(h, sigma, depth)
 
 
 class PlanarLifter:

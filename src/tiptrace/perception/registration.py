@@ -53,9 +53,9 @@ class RegisteredTracker:
         """Radius of the discs of :meth:`mask`."""
         return self._meter.mask_radius_px
 
-    def mask(self, uv_px: FloatArray, shape: tuple[int, int]) -> BoolArray:
-        """Pixels (H, W) of dots at places (n, 2), with a margin."""
-        return self._meter.mask(uv_px, shape)
+    def mask(self, uv_px: FloatArray, shape: tuple[int, int], step: int = 1) -> BoolArray:
+        """Pixels of dots at places (n, 2), with a margin, in a map (H, W) that has every ``step``-th pixel."""
+        return self._meter.mask(uv_px, shape, step)
 
     def update(self, image: Image) -> tuple[FloatArray, BoolArray]:
         """Track into the next image: uv_px (n, 2), NaN where lost, and tracked (n,)."""

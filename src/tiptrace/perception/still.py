@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from tiptrace.errors import PerceptionError
-from tiptrace.perception.depth import DepthMap, PaperDepth
+from tiptrace.perception.depth import DepthMap, PaperDepth, at_image_size
 from tiptrace.perception.full_depth import FullDepth
 from tiptrace.perception.gel_model import GelModel
 from tiptrace.perception.markers import detect_markers, dot_mask
@@ -53,6 +53,7 @@ def depth_of_image(
         uv_px = detect_markers(image).uv_px
     except PerceptionError:  # a gel without dots
         uv_px = np.zeros((0, 2))
-    depth = chain(image, dot_mask(image), uv_px)
+    size = (chain.shape[1], chain.shape[0])
+    mask = cv2.resize(dot_mask(image).astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0
     height, width = image.shape[:2]
-    return chain.at_image_size(depth, (height, width))
+    return at_image_size(chain(image, np.asarray(mask), uv_px), (height, width))
