@@ -87,7 +87,7 @@ class LocalAnchoringEstimator:
     A window without rotation says nothing; there the last estimate, carried by the tool's motion, fills in (ridge).
     """
 
-    def __init__(self, window: int = 25, ridge_rad: float = 0.03) -> None:
+    def __init__(self, window: int = 25, ridge_rad: float = 0.3) -> None:
         """Set the window.
 
         Args:
