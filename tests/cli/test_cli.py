@@ -14,7 +14,10 @@ from tiptrace.sim.spec import make_spec
 from tiptrace.streams.simulated import SimulatedStream
 from tiptrace.streams.writer import write_recording
 
-COMMANDS = ("demo", "simulate", "reconstruct", "inspect", "track", "depth", "surface", "calibrate")
+COMMANDS = (
+    *("demo", "simulate", "reconstruct", "inspect", "evaluate", "compare", "surface", "track", "depth"),
+    *("plan-anchor", "import-gel", "calibrate gel", "calibrate check", "calibrate tip"),
+)
 
 
 @pytest.fixture
@@ -43,9 +46,10 @@ def trial(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_has_help_with_an_example(run, command: str) -> None:  # type: ignore[no-untyped-def]
-    code, text = run(command, "--help")
+    code, text = run(*command.split(), "--help")
     assert code == 0
-    assert "tiptrace " in text or command == "calibrate"
+    assert "Example" in text
+    assert f"tiptrace {command} " in " ".join(text.split())
 
 
 def test_reconstruct_writes_its_files_and_prints_a_table(run, trial: Path, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]

@@ -9,11 +9,16 @@ from rich.console import Console
 from rich.markup import escape
 
 import tiptrace
+from tiptrace.cli.calibrate_check import calibrate_check
+from tiptrace.cli.calibrate_gel import calibrate_gel
 from tiptrace.cli.calibrate_tip import calibrate_tip
+from tiptrace.cli.compare import compare
 from tiptrace.cli.demo import demo
 from tiptrace.cli.depth import depth
 from tiptrace.cli.evaluate import evaluate
+from tiptrace.cli.import_gel import import_gel
 from tiptrace.cli.inspect import inspect
+from tiptrace.cli.plan_anchor import plan_anchor
 from tiptrace.cli.reconstruct import reconstruct
 from tiptrace.cli.simulate import simulate
 from tiptrace.cli.surface import surface
@@ -37,6 +42,11 @@ app.command()(evaluate)
 app.command()(surface)
 app.command()(track)
 app.command()(depth)
+app.command()(compare)
+app.command("plan-anchor")(plan_anchor)
+app.command("import-gel")(import_gel)
+calibrate.command("gel")(calibrate_gel)
+calibrate.command("check")(calibrate_check)
 calibrate.command("tip")(calibrate_tip)
 
 
