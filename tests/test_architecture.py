@@ -22,9 +22,16 @@ MAY_IMPORT = {
     "outputs": BASE | {"geometry", "evaluation"},
     "tracer": BASE | {"geometry", "perception", "estimation"},
     "pipeline": BASE | {"geometry", "streams", "tracer"},
-    "trial_runs": BASE | {"estimation", "evaluation", "pipeline", "reconstruction", "sim", "streams", "tracer"},
+    "trial_runs": BASE
+    | {"estimation", "evaluation", "pipeline", "reconstruction", "sim", "streams", "tracer"},
+    "batch_plan": BASE,
+    "frames": BASE | {"evaluation", "pipeline"},
+    "batch": BASE
+    | {"batch_plan", "evaluation", "frames", "outputs", "reconstruction", "streams", "trial_runs"},
+    "export": BASE | {"batch_plan", "frames", "outputs", "pipeline", "streams", "tracer"},
     "trial_plan": BASE | {"evaluation", "sim", "trial_runs"},
-    "reconstruction": BASE | {"estimation", "evaluation", "geometry", "outputs", "pipeline", "streams", "tracer"},
+    "reconstruction": BASE
+    | {"estimation", "evaluation", "geometry", "outputs", "pipeline", "streams", "tracer"},
 }
 
 

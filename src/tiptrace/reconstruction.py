@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -85,6 +86,8 @@ def reconstruct(
     command: str = "",
     source: str = "",
     on_pair: Callable[[int], None] | None = None,
+    on_step: Callable[[Step], None] | None = None,
+    threads: bool = True,
 ) -> Reconstruction:
     """Trace a stream and write the outputs of ``docs/data.md`` into a folder.
 
@@ -98,14 +101,16 @@ def reconstruct(
         command: Command that reproduces it.
         source: File that it came from.
         on_pair: Called with the number of pairs done.
+        on_step: Called with each turn of the loop.
+        threads: One thread per finger; without them all runs in the caller's.
 
     Raises:
         TipTraceError: the recording cannot give a trajectory; the message says why.
     """
     samples = stream.truth()
     truth = Truth.from_samples(samples) if samples else None
-    sync, watch = SyncReport(), _Watch(on_pair, keep_pairs=bool(beside), keep_images=report)
-    with open_tracer(stream, method) as tracer:
+    sync, watch = SyncReport(), _Watch(on_pair, bool(beside), report, on_step)
+    with open_tracer(stream, method) if threads else nullcontext(make_tracer(stream, method)) as tracer:
         watch.tracer = tracer
         trajectory = trace(stream, tracer, watch, sync)
     others = (MethodResult(m, _beside(stream, m, method, watch.pairs, truth)) for m in beside)
@@ -170,6 +175,7 @@ class _Watch:
     on_pair: Callable[[int], None] | None
     keep_pairs: bool
     keep_images: bool
+    on_step: Callable[[Step], None] | None = None
     tracer: TipTracer | None = None
     times_ms: list[tuple[float, float, float]] = field(default_factory=list)
     pairs: list[SensedPair] = field(default_factory=list)
@@ -188,6 +194,8 @@ class _Watch:
         self._keep_motion(step)
         if self.on_pair is not None:
             self.on_pair(len(self.times_ms))
+        if self.on_step is not None:
+            self.on_step(step)
 
     def _keep_motion(self, step: Step) -> None:
         assert self.tracer is not None

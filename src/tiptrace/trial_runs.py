@@ -51,7 +51,7 @@ def run_trial(task: TrialTask, methods: Sequence[str]) -> TrialRun:
     """
     source = json.loads(task.source)
     stream, events = _open(source)
-    task = _described(task, stream.trial)
+    task = described(task, stream.trial)
     samples = read_truth(Path(source["truth"])) if source.get("truth") else stream.truth()
     found = _Traced(stream)
     for method in methods:
@@ -103,7 +103,7 @@ def _open(source: dict[str, Any]) -> tuple[Trial, tuple[Event, ...] | None]:
     return open_recording(Path(source["path"]), **options), None
 
 
-def _described(task: TrialTask, trial: dict[str, Any]) -> TrialTask:
+def described(task: TrialTask, trial: dict[str, Any]) -> TrialTask:
     """The task with condition, level and seed where a recording's metadata name them."""
     parts = [trial.get(key) for key in ("trajectory", "tool", "wrist", "grasp")]
     condition = Condition(*map(str, parts)) if all(parts) else task.condition

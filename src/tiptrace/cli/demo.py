@@ -27,7 +27,7 @@ def demo(
     out.mkdir(parents=True, exist_ok=True)
     simulate(out=trial, seed=seed)
     console.print("[bold]2/2[/] the tip's trajectory from the two tactile image streams and the robot's pose")
-    reconstruct(trial, out=out, method="full", beside=["paper", "ee-only"])
+    reconstruct([trial], out=out, method="full", beside=["paper", "ee-only"])
     console.print(
         f"\nOpen [bold]{out / 'report.html'}[/] in a browser. What to try next:\n"
         f"  tiptrace inspect {trial}\n"
