@@ -22,7 +22,7 @@ _ROUNDS = 5
 _ONE_PLACE = 0.25  # of the width and height of the image
 _FIT_PIXELS = 600  # of each press while circles are sought
 _MISFIT = 2.5  # residual, in units of the usual one, at which the contact ends
-_GROWTH = 1.1  # the contact ends at most this much beyond the strongest colour change
+_GROWTH = 0.97  # the contact ends where the colour changes most, a little blurred
 _NOT_STEEPER = 0.94  # sine of the steepest slope taken from a ball
 
 

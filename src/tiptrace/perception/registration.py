@@ -19,6 +19,8 @@ from tiptrace.perception.tracking import Grey, grey_image, lucas_kanade
 from tiptrace.types import BoolArray, FloatArray, Image
 
 _BACK_PX = 1.0  # forward–backward mismatch
+_LEAP = 0.6  # of the pitch: a marker that moves so far more than the others has gone to another dot
+_SAME_BRIGHTNESS = 0.02
 _AREA = (0.4, 2.2)  # of the first frame's
 _INK = 0.45  # of the first frame's contrast
 _OFF_GRID = 0.38  # of the pitch: distance from where the neighbours say
@@ -73,16 +75,28 @@ class RegisteredTracker:
     def _follow(self, grey: Grey) -> tuple[FloatArray, BoolArray]:
         """Lucas–Kanade there and back; where that fails, the neighbours' displacement."""
         start = self.expected_px
-        moved, there = lucas_kanade(self._grey, grey, start)
-        back, again = lucas_kanade(grey, self._grey, moved, start)
+        now = self._as_bright_as_before(grey)
+        moved, there = lucas_kanade(self._grey, now, start)
+        back, again = lucas_kanade(now, self._grey, moved, start)
         mismatch = np.linalg.norm(back - start, axis=1)
         followed = there & again & (mismatch < _BACK_PX) & self._tracked
+        if followed.any():
+            common = np.median((moved - start)[followed], axis=0)
+            leap = np.linalg.norm(moved - start - common, axis=1)
+            followed &= leap < _LEAP * self._around.pitch_px
         predicted, enough = self._around.predict(moved - self._rest, followed)
         off = np.linalg.norm(moved - self._rest - predicted, axis=1)
         followed &= ~enough | (off < _OFF_GRID * self._around.pitch_px)
         predicted, enough = self._around.predict(moved - self._rest, followed)
         held = np.where(enough[:, None], self._rest + predicted, start)
         return np.where(followed[:, None], moved, held), followed
+
+    def _as_bright_as_before(self, grey: Grey) -> Grey:
+        """Lucas–Kanade takes a change of brightness for motion: lamps are evened out first."""
+        gain = float(self._grey.mean()) / max(float(grey.mean()), 1.0)
+        if abs(gain - 1.0) < _SAME_BRIGHTNESS:
+            return grey
+        return np.asarray(cv2.convertScaleAbs(grey, alpha=gain), dtype=np.uint8)
 
     def _is_dot(self, dots: DotMeasurement, which: NDArray[np.intp], shape: tuple[int, ...]) -> BoolArray:
         """Whether measurements of some markers show a dot: dark, of the right size, not cut by the border."""

@@ -1,0 +1,121 @@
+import numpy as np
+import pytest
+
+from tiptrace.perception.markers import detect_markers
+from tiptrace.perception.registration import RegisteredTracker
+from tiptrace.perception.seeding import seed
+
+from .gel_images import BASE, H, W, grid, paint_dots, shade, to_uint8
+
+
+def start(uv, diameter=10.5):
+    image = to_uint8(paint_dots(shade(), uv, diameter), 1.5)
+    tracker = RegisteredTracker(image, detect_markers(image))
+    order = np.linalg.norm(uv[:, None] - tracker.start_px[None], axis=2).argmin(axis=1)
+    return tracker, order
+
+
+def step(tracker, order, uv, seed=1, diameter=10.5, edit=lambda image: image):
+    image = edit(paint_dots(shade(), uv, diameter))
+    found, tracked = tracker.update(to_uint8(image, 1.5, seed))
+    return found[order], tracked[order]
+
+
+INTERIOR = (grid() > 40).all(axis=1) & (grid()[:, 0] < W - 40) & (grid()[:, 1] < H - 40)
+
+
+def test_no_drift_over_hundreds_of_frames():
+    """A circular walk of 150 frames ends where it began, to the noise of a single frame."""
+    rest = grid()
+    tracker, order = start(rest)
+    errors = []
+    for t in range(1, 151):
+        uv = rest + 6 * np.array([np.cos(t / 9) - 1, np.sin(t / 9)])
+        found, tracked = step(tracker, order, uv, seed=t)
+        assert tracked[INTERIOR].all()
+        errors.append((found - uv)[INTERIOR])
+    errors = np.array(errors)
+    assert np.sqrt(np.mean(errors**2)) < 0.05
+    assert np.abs(errors[-20:].mean(axis=0)).max() < np.abs(errors[:20].mean(axis=0)).max() + 0.03
+
+
+@pytest.mark.parametrize("direction", [(12, 0), (0, -12), (8.4, 8.4)])
+def test_a_jump_of_twelve_pixels(direction):
+    rest = grid()
+    tracker, order = start(rest)
+    found, tracked = step(tracker, order, rest + np.array(direction))
+    assert tracked[INTERIOR].all()
+    assert np.linalg.norm(found - rest - direction, axis=1)[INTERIOR].max() < 0.2
+
+
+def test_hidden_markers_are_flagged_and_found_again_under_their_own_index():
+    rest = grid()
+    tracker, order = start(rest)
+
+    def hide(image):
+        image[80:170, 90:200] = BASE
+        return image
+
+    hidden = (rest[:, 0] > 95) & (rest[:, 0] < 195) & (rest[:, 1] > 85) & (rest[:, 1] < 165)
+    for t in range(1, 6):  # hidden for five frames while everything moves
+        found, tracked = step(tracker, order, rest + [1.5 * t, 0.5 * t], seed=t, edit=hide)
+        assert not tracked[hidden].any()
+        assert np.isnan(found[hidden]).all()
+    for t in range(6, 8):
+        found, tracked = step(tracker, order, rest + [1.5 * t, 0.5 * t], seed=t)
+    assert tracked[INTERIOR].all()
+    assert np.linalg.norm(found - rest - [10.5, 3.5], axis=1)[INTERIOR].max() < 0.2
+
+
+def test_one_missing_dot_is_not_replaced_by_its_neighbour():
+    rest = grid()
+    tracker, order = start(rest)
+    gone = int(np.flatnonzero(INTERIOR)[5])
+    others = np.delete(np.arange(len(rest)), gone)
+    for t in range(1, 10):
+        image = paint_dots(shade(), rest[others] + [2.0 * t, 0], 10.5)
+        found, tracked = tracker.update(to_uint8(image, 1.5, t))
+        found, tracked = found[order], tracked[order]
+    assert not tracked[gone]
+    keep = INTERIOR & (np.arange(len(rest)) != gone)
+    assert np.linalg.norm(found - rest - [18.0, 0], axis=1)[keep].max() < 0.2
+
+
+def test_brightness_and_shading_do_not_move_dots():
+    rest = grid()
+    tracker, order = start(rest)
+    v, u = np.indices((H, W))
+    for gain in (0.8, 1.15):
+        tilt = 1 + 0.3 * np.sin(u / 60.0) * np.cos(v / 50.0)
+        found, tracked = step(
+            tracker, order, rest, edit=lambda image, g=gain, s=tilt: image * g * s[..., None]
+        )
+        assert tracked[INTERIOR].all()
+        assert np.linalg.norm(found - rest, axis=1)[INTERIOR].max() < 0.15
+
+
+@pytest.mark.parametrize(("pitch", "diameter"), [(18, 6), (33, 18)])
+def test_other_gels(pitch, diameter):
+    rest = grid(pitch)
+    tracker, order = start(rest, diameter)
+    inside = (rest > 40).all(axis=1) & (rest[:, 0] < W - 40) & (rest[:, 1] < H - 40)
+    for t in range(1, 6):
+        found, tracked = step(tracker, order, rest + [1.7 * t, -0.9 * t], seed=t, diameter=diameter)
+    assert tracked[inside].all()
+    assert np.linalg.norm(found - rest - [8.5, -4.5], axis=1)[inside].max() < 0.3
+
+
+def test_dots_that_detection_misses_are_taken_from_the_untouched_gel():
+    rest = grid()
+    moved = rest + [4.0, -2.0]
+    image = paint_dots(shade(), moved, 10.5)
+    faint = int(np.flatnonzero(INTERIOR)[8])
+    u, v = moved[faint].round().astype(int)
+    image[v - 12 : v + 13, u - 12 : u + 13] *= 0.55  # in deep shade
+    image = to_uint8(image, 1.0)
+    reference = to_uint8(paint_dots(shade(), rest, 10.5), 1.0)
+    seeds = seed(image, reference)
+    distance = np.linalg.norm(seeds.markers.uv_px - moved[faint], axis=1)
+    assert distance.min() < 0.5
+    np.testing.assert_allclose(seeds.rest_px[distance.argmin()], rest[faint], atol=0.5)
+    assert np.linalg.norm(seeds.markers.uv_px - seeds.rest_px - [4.0, -2.0], axis=1).max() < 0.5
