@@ -1,0 +1,69 @@
+"""``tiptrace export``: training data."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def export(
+    paths: Annotated[
+        list[Path],
+        typer.Argument(help="Results of `tiptrace reconstruct`, recordings, or folders of either."),
+    ],
+    to: Annotated[str, typer.Option(help="parquet or zarr.")] = "parquet",
+    out: Annotated[Path | None, typer.Option(help="File (parquet) or folder (zarr) to write.")] = None,
+    method: Annotated[str, typer.Option(help="For recordings; results have theirs.")] = "full",
+    map_file: Annotated[
+        Path | None, typer.Option("--map", help="map.yaml for other people's recordings.")
+    ] = None,
+    rig: Annotated[Path | None, typer.Option(help="rig.yaml, in place of the attached ones.")] = None,
+    reference_frames: Annotated[
+        str | None, typer.Option(help="Frames that show the untouched gel, e.g. 0:20.")
+    ] = None,
+) -> None:
+    """Write the tip at every image pair, with covariance and validity, as a dataset for learning.
+
+    The estimates are causal: none uses an image later than its own. Many recordings are exported fastest from their
+    results, made with several workers.
+
+    Examples:
+
+      tiptrace export trial.mcap --to parquet --out tip.parquet
+
+      tiptrace reconstruct recordings/ --workers 8 --out results
+
+      tiptrace export results --to zarr --out tip.zarr
+    """
+    from rich.console import Console
+
+    from tiptrace.cli.show import progress_bar
+    from tiptrace.errors import ConfigError
+    from tiptrace.export.dataset import FORMATS, export_dataset
+    from tiptrace.export.episodes import find_sources
+    from tiptrace.tracer import METHODS
+
+    if to not in FORMATS:
+        raise ConfigError(f"unknown format '{to}'; valid: {', '.join(FORMATS)}")
+    if method not in METHODS:
+        raise ConfigError(f"unknown method '{method}'; valid: {', '.join(METHODS)}")
+    given = {"map_file": map_file, "rig": rig, "reference_frames": reference_frames}
+    options = {key: str(value) for key, value in given.items() if value is not None}
+    target = out or Path(f"tip.{to}")
+    sources, missing, notes = find_sources(paths, bags=map_file is not None)
+    with progress_bar() as progress:
+        bar = progress.add_task("episodes", total=len(sources))
+        done = export_dataset(sources, to, target, method, options, lambda _: progress.advance(bar))
+    console = Console(highlight=False, markup=False, soft_wrap=True)
+    for note in notes:
+        console.print(f"note: {note}")
+    failures = [*missing, *done.failures]
+    for name, reason in failures:
+        console.print(f"failed: {name}: {reason}")
+    episodes = done.record["episodes"]
+    frames, valid = (sum(e[key] for e in episodes) for key in ("frames", "valid_frames"))
+    console.print(f"{target}: {len(episodes)} episodes, {frames} frames, {valid} valid, causal estimates")
+    if failures:
+        raise typer.Exit(1)

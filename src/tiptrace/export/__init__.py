@@ -1,0 +1,1 @@
+"""Training data: the tip at the frames of a recording, for others' tools."""
