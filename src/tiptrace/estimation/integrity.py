@@ -190,11 +190,6 @@ class Monitor:
         self._path.append(D)
         axial = float(D @ ref.axis_E)
         c = self._config
-        if not self._contact:
-            self._contact = abs(axial - self._free_m) > c.regain_m
-            if self._contact:
-                self._path.clear()
-            return
         if len(self._path) < _STILL:
             return
         path = np.stack(self._path)
@@ -202,6 +197,11 @@ class Monitor:
         across = path - np.outer(along, ref.axis_E)
         thirds = np.stack([across[:3].mean(axis=0), across[3:7].mean(axis=0), across[7:].mean(axis=0)])
         swing = float(np.linalg.norm(thirds - thirds.mean(axis=0), axis=1).max())
+        if not self._contact:  # what moves against the hand is held by something
+            self._contact = abs(axial - self._free_m) > c.regain_m or swing > 2.0 * c.still_across_m
+            if self._contact:
+                self._path.clear()
+            return
         out = float(np.median(along)) > ref.axial_m[1] + c.release_m
         if out and np.ptp(along) < c.still_axial_m and swing < c.still_across_m:
             self._contact, self._free_m = False, float(np.median(along))
