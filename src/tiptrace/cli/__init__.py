@@ -16,6 +16,7 @@ from tiptrace.cli.compare import compare
 from tiptrace.cli.demo import demo
 from tiptrace.cli.depth import depth
 from tiptrace.cli.evaluate import evaluate
+from tiptrace.cli.export import export
 from tiptrace.cli.import_gel import import_gel
 from tiptrace.cli.inspect import inspect
 from tiptrace.cli.plan_anchor import plan_anchor
@@ -43,6 +44,7 @@ app.command()(surface)
 app.command()(track)
 app.command()(depth)
 app.command()(compare)
+app.command()(export)
 app.command("plan-anchor")(plan_anchor)
 app.command("import-gel")(import_gel)
 calibrate.command("gel")(calibrate_gel)
