@@ -98,6 +98,11 @@ def test_another_gel_than_the_rig_says():
         finger.sense(gel_image())
 
 
+def test_a_touched_reference():
+    with pytest.raises(PerceptionError, match="touched or dirty"):
+        Finger(SENSOR, linear_gel(), gel_image(0.8e-3, sigma_px=20), FULL)
+
+
 def test_no_model_and_no_reference():
     with pytest.raises(PerceptionError, match="no gel model"):
         Finger(SENSOR, None, gel_image(), FULL)

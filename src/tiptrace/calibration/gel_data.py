@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tiptrace.errors import CalibrationError, PerceptionError
-from tiptrace.perception.background import has_dots, untouched_background
+from tiptrace.perception.background import check_untouched, has_dots, untouched_background
 from tiptrace.perception.markers import check_image, detect_markers, dot_mask
 from tiptrace.types import BoolArray, Image
 
@@ -98,11 +98,13 @@ def read_press_folder(folder: Path, mm_per_px: tuple[float, float] | None = None
         raise CalibrationError(f"{folder / 'presses.csv'}: mm_per_px differs between rows; give one scale")
     given = mm_per_px or ((scale := scales.pop(), scale) if scales else None)
     scale = GELSIGHT_MINI_WIDTH_MM / reference.shape[1]
-    background = untouched_background(reference)
-    _check_reference(reference, background, folder)
+    try:
+        check_untouched(reference)
+    except PerceptionError as error:
+        raise CalibrationError(f"{folder / 'reference.png'}: {error}") from None
     return PressFolder(
         reference=reference,
-        background=background,
+        background=untouched_background(reference),
         presses=presses,
         mm_per_px=given or (scale, scale),
         scale_is_assumed=given is None,
@@ -165,18 +167,3 @@ def _press(folder: Path, row: dict[str, str], line: int, reference: Image, dotte
         raise CalibrationError(f"{where}: give all of {', '.join(_CIRCLE)} or none")
     dots = dot_mask(image, 2) if dotted else np.zeros(image.shape[:2], dtype=np.bool_)
     return Press(row["image"], image, dots, diameter, Circle(*values) if values else None)
-
-
-def _check_reference(reference: Image, background: Float32Map, folder: Path) -> None:
-    """A touched reference shows edges that neither lamps nor dots make."""
-    residual = np.abs(reference.astype(np.float32) - background)
-    residual[dot_mask(reference, 4)] = 0.0
-    worst = float(cv2.GaussianBlur(residual, (0, 0), reference.shape[1] / 160.0).max())
-    if worst > _TOUCHED:
-        raise CalibrationError(
-            f"{folder / 'reference.png'}: the gel looks touched or dirty (an edge of {worst:.0f} grey levels); "
-            "take the reference with nothing on the gel"
-        )
-
-
-_TOUCHED = 12.0

@@ -37,8 +37,8 @@ class GelHealth:
     Attributes:
         touched: Whether the image shows a contact; flatness is then of the rest of the gel.
         flatness_um: Rms height of untouched gel against the reference, tilt removed.
-        curl: Rms curl of the slope field over its rms variation; a surface has none, a network that no longer fits
-            the gel makes some.
+        curl: Rms curl of the slope field over its rms variation in a contact; a surface has none, a network that no
+            longer fits the gel makes some. NaN on untouched gel, where there is nothing but noise.
         illumination_change: Largest change of a channel's brightness against the reference, as a share.
         dots: Dots found.
         dots_lost: Dots of the reference that are gone or have merged.
@@ -112,7 +112,7 @@ def _score(
     return GelHealth(
         touched=touched,
         flatness_um=_flatness_um(change, calm, metres_per_px),
-        curl=_curl(change, ~mask),
+        curl=_curl(change, ~mask) if touched else float("nan"),
         illumination_change=float(np.abs(gain - 1.0).max()),
         dots=dots,
         dots_lost=lost,

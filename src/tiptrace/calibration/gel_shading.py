@@ -81,18 +81,27 @@ def _basis(slopes: FloatArray, unit_uv: FloatArray, place_degree: int) -> FloatA
     """(n, k): every φ_k(n) − φ_k(e_z) times every power of the place."""
     n_z = 1.0 / np.sqrt(1.0 + np.sum(slopes * slopes, axis=1))
     a, b = slopes[:, 0] * n_z, slopes[:, 1] * n_z
-    phi = [a, b, n_z - 1.0, a * a, a * b, b * b]
-    for elevation in _ELEVATIONS:
-        for azimuth in 2.0 * np.pi * np.arange(_AZIMUTHS) / _AZIMUTHS:
-            across = np.cos(elevation) * (np.cos(azimuth) * a + np.sin(azimuth) * b)
-            facing = across + np.sin(elevation) * n_z
-            phi.append(_soft_positive(facing) - _soft_positive(np.sin(elevation)))
+    smooth = np.stack([a, b, n_z - 1.0, a * a, a * b, b * b], axis=1)
+    lamps = _soft_positive(np.stack([a, b, n_z], axis=1) @ _LAMPS) - _soft_positive(_LAMPS[2])
+    phi = np.concatenate([smooth, lamps], axis=1)  # (n, 38)
     x, y = 2.0 * unit_uv[:, 0] - 1.0, 2.0 * unit_uv[:, 1] - 1.0
     psi = [x**i * y**j for i in range(place_degree + 1) for j in range(place_degree + 1 - i)]
-    product = np.stack(phi, axis=1)[:, :, None] * np.stack(psi, axis=1)[:, None, :]
-    return np.asarray(product.reshape(len(slopes), -1))
+    return np.concatenate([phi * g[:, None] for g in psi], axis=1)
 
 
-def _soft_positive(x: FloatArray | float) -> FloatArray:
+def _soft_positive(x: FloatArray) -> FloatArray:
     """max(x, 0) with its corner rounded: lamps are wide."""
     return np.asarray(0.5 * (x + np.sqrt(np.square(x) + _SOFTNESS**2)))
+
+
+def _lamp_directions() -> FloatArray:
+    """(3, lamps) unit vectors all around at each elevation."""
+    azimuth = 2.0 * np.pi * np.arange(_AZIMUTHS) / _AZIMUTHS
+    rings = [
+        np.stack([np.cos(e) * np.cos(azimuth), np.cos(e) * np.sin(azimuth), np.full(_AZIMUTHS, np.sin(e))])
+        for e in _ELEVATIONS
+    ]
+    return np.concatenate(rings, axis=1)
+
+
+_LAMPS = _lamp_directions()

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from tiptrace.config import Sensor
 from tiptrace.errors import PerceptionError
+from tiptrace.perception.background import check_untouched
 from tiptrace.perception.depth import DepthMap, PaperDepth, at_image_size
 from tiptrace.perception.full_depth import FullDepth
 from tiptrace.perception.gel_model import GelModel
@@ -61,6 +62,7 @@ class Finger:
         with self._named():
             if reference is not None:
                 check_image(reference, sensor.image_size_px)
+                check_untouched(reference)
             self._depth = self._depth_chain(gel, reference)
 
     @property

@@ -1,0 +1,264 @@
+import csv
+
+import cv2
+import numpy as np
+import pytest
+
+from tiptrace.calibration.gel import train_gel
+from tiptrace.calibration.gel_circles import find_circles
+from tiptrace.calibration.gel_data import Circle, read_press_folder
+from tiptrace.calibration.gel_evaluation import angles_deg, fitted_radius_px, measured_slopes
+from tiptrace.calibration.gel_health import check_gel
+from tiptrace.calibration.gel_shading import fit_shading
+from tiptrace.errors import CalibrationError
+from tiptrace.perception.background import untouched_background
+from tiptrace.perception.gel_model import load_gel_model
+from tiptrace.sim.dots import DotLayout
+from tiptrace.sim.presses import PressPlan, render_press, write_press_folder
+from tiptrace.sim.render import TactileRenderer
+
+MM_PER_PX = (0.0625, 0.0625)
+
+
+def write(folder, layout=None, circles=True, columns=5, rows=3):
+    presses = write_press_folder(folder, PressPlan(layout=layout, columns=columns, rows=rows, seed=3))
+    if not circles:
+        table = [(f["image"], f["ball_diameter_mm"]) for f in csv.DictReader((folder / "presses.csv").open())]
+        with (folder / "presses.csv").open("w") as file:
+            csv.writer(file).writerows([("image", "ball_diameter_mm"), *table])
+    return presses
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("presses")
+    presses = write(folder, circles=False)
+    out = folder / "gel.onnx"
+    told = []
+    report = train_gel(
+        folder,
+        out,
+        mm_per_px=MM_PER_PX,
+        pictures=folder / "pictures",
+        progress=lambda label, share: told.append((label, share)),
+    )
+    return folder, presses, report, told
+
+
+@pytest.mark.parametrize("layout", [None, DotLayout()])
+def test_contacts_are_found_without_being_told(layout, tmp_path):
+    presses = write(tmp_path, layout, circles=False)
+    data = read_press_folder(tmp_path, MM_PER_PX)
+    circles = find_circles(data)
+    H, W = data.reference.shape[:2]
+    inner = [
+        i for i, p in enumerate(presses) if 30 < p.center_px[0] < W - 30 and 30 < p.center_px[1] < H - 30
+    ]
+    off = [
+        np.hypot(circles[i].u - presses[i].center_px[0], circles[i].v - presses[i].center_px[1])
+        for i in inner
+    ]
+    size = [circles[i].radius / presses[i].contact_radius_px for i in inner]
+    assert np.median(off) < 0.3
+    assert max(off) < 1.5
+    assert 0.85 < np.median(size) < 1.1
+
+
+def test_wrong_circles_are_not_believed(tmp_path):
+    presses = write(tmp_path)
+    rows = list(csv.DictReader((tmp_path / "presses.csv").open()))
+    for row in rows:
+        row["center_u_px"] = str(float(row["center_u_px"]) + 12)
+    with (tmp_path / "presses.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0].keys())
+        writer.writeheader()
+        writer.writerows(rows)
+    circles = find_circles(read_press_folder(tmp_path, MM_PER_PX))
+    off = [
+        np.hypot(c.u - p.center_px[0], c.v - p.center_px[1]) for c, p in zip(circles, presses, strict=True)
+    ]
+    assert np.median(off) < 0.3
+
+
+def test_held_out_presses_are_measured(trained):
+    folder, _, report, told = trained
+    assert report.normal_error_deg < 2.0
+    assert report.radius_error < 0.05
+    assert report.depth_rms_m < 20e-6
+    assert report.flatness_m < 20e-6
+    assert not report.one_place
+    assert not report.scale_is_assumed
+    assert len(report.held_out) == 3
+    names = {s.name for s in report.held_out}
+    assert not names & set(report.trained_on)
+    for score in report.held_out:
+        picture = cv2.imread(str(folder / "pictures" / score.name))
+        assert picture is not None
+        assert picture.shape[1] > 600
+    assert told[-1][1] == pytest.approx(1.0)
+
+
+def test_the_model_measures_presses_it_has_never_seen(trained):
+    """Truth from the renderer: slopes of another session's presses on the same gel."""
+    _, _, report, _ = trained
+    gel = load_gel_model(report.model)
+    assert gel.mm_per_px == MM_PER_PX
+    assert gel.metadata["tiptrace.image_size_px"] == "320,240"
+    renderer = TactileRenderer(seed=77)
+    background = untouched_background(renderer.reference())
+    errors = []
+    for place, diameter, depth in (((100.0, 90.0), 5e-3, 0.8e-3), ((220.0, 150.0), 7e-3, 1.2e-3)):
+        press = render_press(renderer, place, diameter, depth, frame=5)
+        slopes = measured_slopes(gel, press.image, background, np.zeros(press.image.shape[:2], bool))
+        touched = np.hypot(*np.moveaxis(press.slope, -1, 0)) > 0.1
+        errors.append(np.median(angles_deg(slopes[touched], press.slope[touched])))
+    assert max(errors) < 2.5
+
+
+def test_presses_in_one_place_are_accepted_and_flagged(tmp_path):
+    renderer = TactileRenderer(seed=1)
+    cv2.imwrite(str(tmp_path / "reference.png"), renderer.reference())
+    lines = ["image,ball_diameter_mm,mm_per_px"]
+    for i in range(8):
+        press = render_press(renderer, (160.0 + i, 120.0 - i), 4e-3, 0.4e-3 + 0.1e-3 * i, frame=i)
+        cv2.imwrite(str(tmp_path / f"{i}.png"), press.image)
+        lines.append(f"{i}.png,4,0.0625")
+    (tmp_path / "presses.csv").write_text("\n".join(lines))
+    report = train_gel(tmp_path, tmp_path / "gel.onnx")
+    assert report.one_place
+    assert report.mm_per_px == MM_PER_PX
+    u0, v0, u1, v1 = report.valid_px
+    assert 120 < u0 < 160 < u1 < 200
+    assert 80 < v0 < 120 < v1 < 160
+    assert load_gel_model(report.model).convention.coordinates == "zero"
+
+
+def test_sphere_fit_and_angles():
+    v, u = np.indices((100, 120), dtype=float)
+    R = 40.0
+    depth = np.sqrt(np.maximum(R**2 - (u - 61.3) ** 2 - (v - 50.2) ** 2, 0)) - 30
+    inside = np.hypot(u - 61.3, v - 50.2) < 25
+    assert fitted_radius_px(depth, Circle(61.3, 50.2, 25), inside) == pytest.approx(R, rel=1e-6)
+    assert angles_deg(np.array([[1.0, 0.0]]), np.array([[0.0, 0.0]]))[0] == pytest.approx(45.0)
+
+
+def test_shading_holds_for_diffuse_lamps_and_zero_on_flat_gel():
+    rng = np.random.default_rng(0)
+    slopes, uv = rng.uniform(-0.8, 0.8, (4000, 2)), rng.uniform(0, 1, (4000, 2))
+    normal = np.column_stack([slopes, np.ones(4000)]) / np.sqrt(1 + np.sum(slopes**2, axis=1))[:, None]
+    lamps = np.array([[0.8, 0.1, 0.6], [-0.5, 0.7, 0.5], [0.0, -0.8, 0.6]])
+    wide = lamps + rng.normal(0, 0.2, (40, 3, 3))  # every lamp has an extent
+    light = np.maximum(np.einsum("nk,mlk->nml", normal, wide), 0).mean(axis=1)
+    light /= np.maximum(wide[..., 2], 0).mean(axis=0)
+    background = rng.uniform(60, 150, (4000, 3))
+    shading = fit_shading(slopes, uv, background * light, background)
+    assert np.all(shading.ratio_change(np.zeros((5, 2)), uv[:5]) == 0)
+    error = background * (1 + shading.ratio_change(slopes, uv) - light)
+    assert np.sqrt(np.mean(error**2)) < 1.3  # grey levels: the least noise of a channel of the real sensor
+
+
+def small_folder(tmp_path):
+    renderer = TactileRenderer(seed=2)
+    cv2.imwrite(str(tmp_path / "reference.png"), renderer.reference())
+    lines = ["image,ball_diameter_mm"]
+    for i in range(6):
+        press = render_press(renderer, (60.0 + 35 * i, 70.0 + 20 * i), 4e-3, 0.8e-3, frame=i)
+        cv2.imwrite(str(tmp_path / f"{i}.png"), press.image)
+        lines.append(f"{i}.png,4")
+    (tmp_path / "presses.csv").write_text("\n".join(lines))
+    return renderer
+
+
+def touched_reference(folder, renderer):
+    from tiptrace.sim.gel import PadContact, deform
+
+    grid = deform(PadContact(np.full((1, 1), -1.0), np.zeros((0, 2)), np.zeros((0, 2)))).grid
+    X, _ = grid.mesh()
+    overlap = np.where(np.abs(X) < 3e-3, 0.9e-3, 0.9e-3 - 3.0 * (np.abs(X) - 3e-3))
+    tool = deform(PadContact(overlap, np.zeros((0, 2)), np.zeros((0, 2))))
+    cv2.imwrite(str(folder / "reference.png"), renderer.render(tool))
+
+
+def spoil(name):
+    def csv_text(text):
+        return lambda folder, _: (folder / "presses.csv").write_text(text)
+
+    def image(path, picture):
+        return lambda folder, _: cv2.imwrite(str(folder / path), picture)
+
+    return {
+        "no reference": lambda folder, _: (folder / "reference.png").unlink(),
+        "no csv": lambda folder, _: (folder / "presses.csv").unlink(),
+        "few": csv_text("image,ball_diameter_mm\n0.png,4\n1.png,4\n"),
+        "column": csv_text("image,diameter\n0.png,4\n"),
+        "number": csv_text("image,ball_diameter_mm\n0.png,four\n"),
+        "ball": csv_text("image,ball_diameter_mm\n0.png,400\n"),
+        "half a circle": csv_text("image,ball_diameter_mm,center_u_px\n0.png,4,100\n"),
+        "absent image": csv_text("image,ball_diameter_mm\nx.png,4\n"),
+        "unreadable": lambda folder, _: (folder / "3.png").write_bytes(b"no image"),
+        "size": image("3.png", np.full((480, 640, 3), 90, np.uint8)),
+        "black": image("3.png", np.zeros((240, 320, 3), np.uint8)),
+        "overexposed": image("reference.png", np.full((240, 320, 3), 255, np.uint8)),
+        "touched": touched_reference,
+    }[name]
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("no reference", r"reference\.png is missing"),
+        ("no csv", r"presses\.csv: cannot be read"),
+        ("few", "2 presses, need at least 6"),
+        ("column", "column 'ball_diameter_mm' is missing"),
+        ("number", "line 2: could not convert"),
+        ("ball", "ball_diameter_mm is 400"),
+        ("half a circle", "give all of center_u_px, center_v_px, contact_radius_px or none"),
+        ("absent image", r"x\.png is missing"),
+        ("unreadable", r"3\.png is not a readable image"),
+        ("size", r"3\.png is 640×480 px, reference\.png is 320×240"),
+        ("black", r"3\.png: tactile image is black"),
+        ("overexposed", r"reference\.png: tactile image is overexposed"),
+        ("touched", "looks touched or dirty"),
+    ],
+)
+def test_bad_folders_are_refused_with_the_reason(name, message, tmp_path):
+    renderer = small_folder(tmp_path)
+    spoil(name)(tmp_path, renderer)
+    with pytest.raises(CalibrationError, match=message):
+        train_gel(tmp_path, tmp_path / "gel.onnx")
+
+
+def test_health_of_a_fresh_and_of_a_worn_gel(trained):
+    _, _, report, _ = trained
+    gel = load_gel_model(report.model)
+    s = (62.5e-6, 62.5e-6)
+    renderer = TactileRenderer(layout=DotLayout(), seed=9)
+    from tiptrace.sim.gel import untouched
+
+    reference = renderer.reference()
+    fresh = renderer.render(untouched(), 4)
+    dimmed = np.clip(fresh * 0.8, 0, 255).astype(np.uint8)
+    scratched = fresh.copy()
+    dots = renderer.dot_truth(untouched()).uv_px
+    for u, v in dots[(np.abs(dots - [160, 120]) < 70).all(axis=1)][:4].round().astype(int):
+        scratched[v - 9 : v + 10, u - 9 : u + 10] = fresh[v - 15, u - 15]
+    health = check_gel([fresh, dimmed, scratched], reference, gel, s)
+    assert set(health[0].verdicts().values()) == {"good"}
+    assert health[1].verdicts()["illumination_change"] == "worn"
+    assert health[1].illumination_change == pytest.approx(0.2, abs=0.03)
+    assert health[2].verdicts()["dots_lost"] == "worn"
+    assert health[2].dots_lost == 4
+    with pytest.raises(CalibrationError, match="no image"):
+        check_gel([], reference, gel, s)
+    with pytest.raises(CalibrationError, match="the reference 320×240"):
+        check_gel([np.full((480, 640, 3), 90, np.uint8)], reference, gel, s)
+
+
+def test_health_sees_a_contact_and_a_lasting_dent(trained):
+    _, _, report, _ = trained
+    gel = load_gel_model(report.model)
+    renderer = TactileRenderer(seed=9)
+    press = render_press(renderer, (150.0, 110.0), 6e-3, 0.8e-3)
+    (score,) = check_gel([press.image], renderer.reference(), gel, (62.5e-6, 62.5e-6))
+    assert score.touched
+    assert np.isnan(score.dots_moved_px)
