@@ -15,7 +15,18 @@ from tiptrace.streams.simulated import SimulatedStream
 from tiptrace.streams.writer import write_recording
 
 COMMANDS = (
-    *("demo", "simulate", "reconstruct", "inspect", "evaluate", "compare", "export", "surface", "track", "depth"),
+    *(
+        "demo",
+        "simulate",
+        "reconstruct",
+        "inspect",
+        "evaluate",
+        "compare",
+        "export",
+        "surface",
+        "track",
+        "depth",
+    ),
     *("plan-anchor", "import-gel", "calibrate gel", "calibrate check", "calibrate tip"),
 )
 
