@@ -1,6 +1,6 @@
 """CPU time of the full estimator per frame and of its Stage I solve.
 
-    python benchmarks/estimation_speed.py
+python benchmarks/estimation_speed.py
 """
 
 from __future__ import annotations
