@@ -16,7 +16,7 @@ from tiptrace.types import FloatArray
 Float32Map = NDArray[np.float32]
 
 _RING_POINTS = 48
-_VARIED = 0.03  # standard deviation of the slope around a dot below which the smooth fill is left as it is
+_VARIED = 0.04  # standard deviation of the slope around a dot below which the smooth fill is left as it is
 _OUTSIDE_PX = 1.0  # map pixels beyond the dot where values are taken
 
 
@@ -28,7 +28,8 @@ class DotFill:
         self._shape, self._radius = shape, radius_px
         half = int(np.ceil(radius_px)) + 1
         dv, du = np.mgrid[-half : half + 1, -half : half + 1]
-        self._offsets = np.stack([du.ravel(), dv.ravel()], axis=1)  # (k, 2)
+        disc = np.hypot(du, dv) <= radius_px + np.sqrt(0.5)
+        self._offsets = np.stack([du[disc], dv[disc]], axis=1)  # (k, 2)
         angle = 2.0 * np.pi * np.arange(_RING_POINTS) / _RING_POINTS
         self._ring = (radius_px + _OUTSIDE_PX) * np.stack([np.cos(angle), np.sin(angle)], axis=1)  # (m, 2)
 

@@ -58,10 +58,10 @@ def smooth_fill(maps: Float32Map, masked: BoolArray) -> Float32Map:
         raise PerceptionError("every pixel of the tactile image counts as marker or as unusable")
     weight = (~masked).astype(np.float32)
     known = np.where(masked[..., None], np.float32(0), maps)
-    return _pull_push(known, weight)
+    return pull_push(known, weight)
 
 
-def _pull_push(weighted: Float32Map, weight: Float32Map) -> Float32Map:
+def pull_push(weighted: Float32Map, weight: Float32Map) -> Float32Map:
     """Values (H, W, c) from sums ``weighted`` with ``weight`` (H, W) in [0, 1]; weight 1 keeps a pixel as it is."""
     if weight.min() >= 1.0 or min(weight.shape) < 4:
         return np.asarray(weighted / np.maximum(weight, 1e-6)[..., None], dtype=np.float32)
@@ -70,6 +70,6 @@ def _pull_push(weighted: Float32Map, weight: Float32Map) -> Float32Map:
     coarse_weight = cv2.pyrDown(weight, dstsize=size)
     confidence = np.minimum(coarse_weight * 2.0, 1.0)  # half a cell of knowledge is enough
     scale = confidence / np.maximum(coarse_weight, 1e-6)
-    coarse = _pull_push(coarse_sum * scale[..., None], confidence)
+    coarse = pull_push(coarse_sum * scale[..., None], confidence)
     below = cv2.pyrUp(coarse, dstsize=(weight.shape[1], weight.shape[0]))
     return np.asarray(weighted + (1.0 - weight)[..., None] * below.reshape(weighted.shape), dtype=np.float32)

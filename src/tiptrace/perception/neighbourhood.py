@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 from tiptrace.types import BoolArray, FloatArray
 
 _NEIGHBOURS = 8
+_DAMPING = 0.4  # of the affine part, in neighbours: few or one-sided neighbours predict their mean
+_SWEEPS = 30
 
 
 class Neighbourhood:
@@ -15,26 +17,39 @@ class Neighbourhood:
 
     def __init__(self, rest_px: FloatArray) -> None:
         """Fix the neighbours on the first frame's positions (n, 2)."""
+        n = len(rest_px)
         distance = np.linalg.norm(rest_px[:, None] - rest_px[None], axis=2)
         np.fill_diagonal(distance, np.inf)
-        k = min(_NEIGHBOURS, len(rest_px) - 1)
+        k = min(_NEIGHBOURS, n - 1)
         self.neighbours: NDArray[np.intp] = np.argsort(distance, axis=1)[:, :k]  # (n, k)
         self.pitch_px = float(np.median(distance.min(axis=1)))
-        rows = np.arange(len(rest_px))[:, None]
+        rows = np.arange(n)[:, None]
         offset = (rest_px[self.neighbours] - rest_px[:, None]) / self.pitch_px  # (n, k, 2)
-        self._A = np.concatenate([np.ones((*offset.shape[:2], 1)), offset], axis=2)  # (n, k, 3)
-        self._weight = 1.0 / (0.5 + distance[rows, self.neighbours] / self.pitch_px) ** 2  # (n, k)
+        A = np.concatenate([np.ones((n, k, 1)), offset], axis=2)  # (n, k, 3)
+        w = 1.0 / (0.5 + distance[rows, self.neighbours] / self.pitch_px) ** 2  # (n, k)
+        AtW = np.swapaxes(A, 1, 2) * w[:, None, :]  # (n, 3, k)
+        M = AtW @ A + np.diag([1e-9, _DAMPING, _DAMPING])[None]
+        self._P = np.zeros((n, n))  # prediction = P @ displacement
+        self._P[rows, self.neighbours] = np.linalg.solve(M, AtW)[:, 0]
+        self._near = np.zeros((n, n))
+        self._near[rows, self.neighbours] = 1.0
 
     def predict(self, displacement_px: FloatArray, known: BoolArray) -> tuple[FloatArray, BoolArray]:
-        """Displacement (n, 2) of every marker from its known neighbours', and (n,) whether they sufficed.
+        """Displacement (n, 2) of every marker from its neighbours', and (n,) whether two of them are known.
 
-        The affine part is damped, so that few or one-sided neighbours predict their mean.
+        Unknown ones take part with what their own neighbours predict for them.
         """
-        use = known[self.neighbours]  # (n, k)
-        w = np.where(use, self._weight, 0.0)
-        d = np.where(use[..., None], displacement_px[self.neighbours], 0.0)  # (n, k, 2)
-        AtW = np.swapaxes(self._A, 1, 2) * w[:, None, :]  # (n, 3, k)
-        damping = np.array([1e-6, 0.4, 0.4])
-        M = AtW @ self._A + np.diag(damping)[None]  # (n, 3, 3)
-        coefficients = np.linalg.solve(M, AtW @ d)  # (n, 3, 2)
-        return coefficients[:, 0], np.asarray(use.sum(axis=1) >= 2)
+        enough = np.asarray(self._near @ known >= 2)
+        if not known.any():
+            return np.zeros_like(displacement_px), enough
+        x = np.where(known[:, None], displacement_px, displacement_px[known].mean(axis=0))
+        unknown = np.flatnonzero(~known)
+        if unknown.size:
+            P = self._P[unknown]
+            for _ in range(_SWEEPS):
+                step = P @ x
+                settled = np.abs(step - x[unknown]).max() < 0.02
+                x[unknown] = step
+                if settled:
+                    break
+        return self._P @ x, enough

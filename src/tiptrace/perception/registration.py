@@ -26,6 +26,9 @@ _INK = 0.45  # of the first frame's contrast
 _OFF_GRID = 0.38  # of the pitch: distance from where the neighbours say
 _SEARCH = 0.45  # of the pitch: how far from its predicted place a lost dot is looked for …
 _FOUND = 0.6  # … and may be found
+_SEARCH_FRAMES = (
+    5  # a dot is looked for in each of the first frames that it is missing from, then in every fifth
+)
 
 
 class RegisteredTracker:
@@ -43,6 +46,7 @@ class RegisteredTracker:
         self._ink, self._area = first.ink, first.area_px
         self._margin = 0.4 * diameter
         self._tracked = np.ones(len(markers), dtype=np.bool_)
+        self._missed, self._frame = np.zeros(len(markers), dtype=np.intp), 0
         self.expected_px: FloatArray = self._rest.copy()
 
     @property
@@ -77,7 +81,7 @@ class RegisteredTracker:
         start = self.expected_px
         now = self._as_bright_as_before(grey)
         moved, there = lucas_kanade(self._grey, now, start)
-        back, again = lucas_kanade(now, self._grey, moved, start)
+        back, again = lucas_kanade(now, self._grey, moved, start, max_level=0)
         mismatch = np.linalg.norm(back - start, axis=1)
         followed = there & again & (mismatch < _BACK_PX) & self._tracked
         if followed.any():
@@ -100,13 +104,15 @@ class RegisteredTracker:
 
     def _is_dot(self, dots: DotMeasurement, which: NDArray[np.intp], shape: tuple[int, ...]) -> BoolArray:
         """Whether measurements of some markers show a dot: dark, of the right size, not cut by the border."""
-        H, W = shape[:2]
         ratio = dots.area_px / self._area[which]
-        whole = (dots.uv_px >= self._margin).all(axis=1) & (
-            dots.uv_px <= np.array([W - 1, H - 1]) - self._margin
-        ).all(axis=1)
+        whole = self._whole(dots.uv_px, shape)
         ok = (dots.ink > _INK * self._ink[which]) & (ratio > _AREA[0]) & (ratio < _AREA[1]) & whole
         return np.asarray(ok, dtype=np.bool_)
+
+    def _whole(self, uv: FloatArray, shape: tuple[int, ...]) -> BoolArray:
+        """Whether dots at places (n, 2) lie in the image entirely."""
+        low, high = self._margin, np.array([shape[1] - 1, shape[0] - 1]) - self._margin
+        return np.asarray(((uv >= low) & (uv <= high)).all(axis=1))
 
     def _near(self, uv: FloatArray, guess: FloatArray, followed: BoolArray) -> BoolArray:
         limit = np.where(followed, max(2.0, 0.12 * self._around.pitch_px), _SEARCH * self._around.pitch_px)
@@ -116,7 +122,10 @@ class RegisteredTracker:
         self, grey: Grey, guess: FloatArray, uv: FloatArray, seen: BoolArray
     ) -> tuple[FloatArray, BoolArray]:
         """Look for missing dots around their predicted places, darkest first."""
-        missing = np.flatnonzero(~seen)
+        self._frame += 1
+        self._missed = np.where(seen, 0, self._missed + 1)
+        due = (self._missed <= _SEARCH_FRAMES) | ((self._frame + np.arange(len(seen))) % _SEARCH_FRAMES == 0)
+        missing = np.flatnonzero(~seen & due & self._whole(guess, grey.shape))
         if not missing.size:
             return uv, seen
         uv, seen = uv.copy(), seen.copy()

@@ -53,7 +53,11 @@ def grey_image(image: Image) -> Grey:
 
 
 def lucas_kanade(
-    previous: Grey, current: Grey, uv_px: FloatArray, guess_px: FloatArray | None = None
+    previous: Grey,
+    current: Grey,
+    uv_px: FloatArray,
+    guess_px: FloatArray | None = None,
+    max_level: int = MAX_LEVEL,
 ) -> tuple[FloatArray, BoolArray]:
     """Pyramidal Lucas–Kanade from one grey image to the next.
 
@@ -62,6 +66,7 @@ def lucas_kanade(
         current: (H, W).
         uv_px: (n, 2) positions in ``previous``.
         guess_px: (n, 2) where to start looking in ``current``; None: at ``uv_px``.
+        max_level: Coarsest level of the pyramid.
 
     Returns:
         (n, 2) positions in ``current`` and (n,) whether each was found.
@@ -75,7 +80,7 @@ def lucas_kanade(
         points,
         start,
         winSize=WINDOW_PX,
-        maxLevel=MAX_LEVEL,
+        maxLevel=max_level,
         criteria=CRITERIA,
         flags=flags,
     )
