@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tiptrace.perception.background import untouched_background
-from tiptrace.perception.depth import DepthMap, untouched_gel, zero_level
+from tiptrace.perception.depth import DepthMap, untouched_gel
 from tiptrace.perception.dot_fill import DotFill
 from tiptrace.perception.fill import smooth_fill
 from tiptrace.perception.gel_model import GelModel
@@ -23,7 +23,9 @@ from tiptrace.types import BoolArray, FloatArray, Image
 Float32Map = NDArray[np.float32]
 
 _RING = np.stack([np.cos(np.arange(8) * np.pi / 4), np.sin(np.arange(8) * np.pi / 4)], axis=1)  # (8, 2)
+_VISIBLE = 0.1  # of the image that must be untouched to level a map by it
 _CALM = 0.02  # slope below which gel may tell about the lamps
+_LEANS = 0.06  # slope below which gel, pressed in or not, may tell about a gain common to the lamps
 _NOISE_M = 12e-6  # of a marker's depth, wherever it lies
 _DEPTH_SHARE = 0.03  # of the depth: what a network errs by in scale on another gel of the same make
 _FILL_SHARE = 0.3  # of the slope's variation around a dot times its radius: error of the fill under it
@@ -58,6 +60,7 @@ class FullDepth:
         self._lamps = LampGain(shape, self._network)
         self._flat = self._network(np.ones_like(self._background))  # what the network says of untouched gel
         self._calm: BoolArray | None = None
+        self._lean_little = np.ones(shape, dtype=np.bool_)
         self._slopes: Float32Map = np.zeros((*shape, 2), dtype=np.float32)
 
     def __call__(self, image: Image, mask: BoolArray, uv_px: FloatArray) -> DepthMap:
@@ -72,7 +75,8 @@ class FullDepth:
         if self._calm is None:  # first frame: nobody has said yet where the gel is calm
             self._measure(ratio, mask, uv_px)
         assert self._calm is not None
-        return self._measure(self._lamps.correct(ratio, self._calm & ~mask), mask, uv_px)
+        ratio = self._lamps.correct(ratio, self._calm & ~mask, self._lean_little & ~mask)
+        return self._measure(ratio, mask, uv_px)
 
     def _measure(self, ratio: Float32Map, mask: BoolArray, uv_px: FloatArray) -> DepthMap:
         """Depth from a ratio image (h, w, 3) that lamps no longer disturb; remembers slopes and calm gel."""
@@ -80,10 +84,13 @@ class FullDepth:
         if self._dot_fill is not None:
             self._dot_fill.apply(self._slopes, (uv_px - (self.step - 1) / 2) / self.step)
         h = -self._solver.integrate(self._slopes[..., 0], self._slopes[..., 1])
-        untouched, visible = untouched_gel(h, self._slopes)
-        h = self._level.apply(h, untouched) if visible else h - zero_level(h, untouched, visible)
+        untouched, _ = untouched_gel(h, self._slopes)
+        visible = float(untouched.mean()) > _VISIBLE
+        h = self._level.apply(h, untouched if visible else None)
         steepness = np.maximum(np.abs(self._slopes[..., 0]), np.abs(self._slopes[..., 1]))
-        self._calm = untouched & (cv2.blur(steepness, (5, 5)) < _CALM)
+        steepness = cv2.blur(steepness, (5, 5))
+        self._calm = untouched & (steepness < _CALM) & visible
+        self._lean_little = np.asarray(steepness < _LEANS)
         return DepthMap(depth_m=h, untouched=untouched, zero_visible=visible)
 
     def expect_dots(self, radius_px: float) -> None:

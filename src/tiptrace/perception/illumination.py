@@ -44,20 +44,34 @@ class LampGain:
         self._gain_0 = np.ones(3)
         self.gain: FloatArray = np.ones(3)
 
-    def correct(self, ratio: Float32Map, calm: BoolArray) -> Float32Map:
-        """Divide a ratio image (H, W, 3) by the gain seen on calm pixels (H, W); too few: by the last gain."""
+    def correct(self, ratio: Float32Map, calm: BoolArray, flat: BoolArray) -> Float32Map:
+        """Divide a ratio image (H, W, 3) by the lamps' gain.
+
+        Args:
+            ratio: Image over the untouched background.
+            calm: (H, W) untouched gel; empty where none is visible.
+            flat: (H, W) gel that leans little, pressed in or not; it tells a common gain where there is no calm gel.
+        """
         means, good = self._blocks(ratio, calm)
-        if self._first is None:
-            if int(good.sum()) >= _LEAST_BLOCKS:
-                self._first = (means, good)
-                self._gain_0 = np.full(3, 1.0 + self._common_change(means[good] - 1.0, self._not_slope[good]))
-                self.gain = self._gain_0
+        if int(good.sum()) < _LEAST_BLOCKS:
+            self._from_flat(ratio, flat)
+        elif self._first is None:
+            self._first = (means, good)
+            self._gain_0 = np.full(3, 1.0 + self._common_change(means[good] - 1.0, self._not_slope[good]))
+            self.gain = self._gain_0
         else:
             means_0, good_0 = self._first
             both = good & good_0
             if int(both.sum()) >= _LEAST_BLOCKS:
                 self.gain = self._gain_0 * np.median(means[both] / means_0[both], axis=0)
+            else:
+                self._from_flat(ratio, flat)
         return np.asarray(ratio / self.gain.astype(np.float32), dtype=np.float32)
+
+    def _from_flat(self, ratio: Float32Map, flat: BoolArray) -> None:
+        means, good = self._blocks(ratio, flat)
+        if int(good.sum()) >= _LEAST_BLOCKS:
+            self.gain = np.full(3, 1.0 + self._common_change(means[good] - 1.0, self._not_slope[good]))
 
     @staticmethod
     def _common_change(change: FloatArray, not_slope: FloatArray) -> float:
@@ -102,12 +116,22 @@ class Level:
         self._y = (np.arange(H) - (H - 1) / 2) * metres_per_px[1]
         self._tilt: FloatArray | None = None
 
-    def apply(self, h: Float32Map, untouched: BoolArray) -> Float32Map:
-        """Depth map (H, W) with untouched gel (H, W) at 0."""
-        tilt = self._plane(h, untouched)
-        self._tilt = tilt if self._tilt is None else self._tilt + _TILT_RATE * (tilt - self._tilt)
-        z = h - self._tilt[0] * self._x[None, :] - self._tilt[1] * self._y[:, None]
-        return np.asarray(z - np.median(z[untouched]), dtype=np.float32)
+    def apply(self, h: Float32Map, untouched: BoolArray | None) -> Float32Map:
+        """Depth map (H, W) with untouched gel (H, W) at 0.
+
+        Where none is visible (None), the last tilt is taken away and the border's lowest decile is 0.
+        """
+        if untouched is not None:
+            tilt = self._plane(h, untouched)
+            self._tilt = tilt if self._tilt is None else self._tilt + _TILT_RATE * (tilt - self._tilt)
+        z = h
+        if self._tilt is not None:
+            z = h - self._tilt[0] * self._x[None, :] - self._tilt[1] * self._y[:, None]
+        if untouched is not None:
+            zero = np.median(z[untouched])
+        else:
+            zero = np.percentile(np.concatenate([z[0], z[-1], z[:, 0], z[:, -1]]), 10)
+        return np.asarray(z - zero, dtype=np.float32)
 
     def _plane(self, h: Float32Map, untouched: BoolArray) -> FloatArray:
         """Tilt (2,) of the robust plane, with a prior of zero: gel seen on one side only hardly tilts the rest."""
