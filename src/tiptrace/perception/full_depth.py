@@ -25,6 +25,7 @@ Float32Map = NDArray[np.float32]
 _RING = np.stack([np.cos(np.arange(8) * np.pi / 4), np.sin(np.arange(8) * np.pi / 4)], axis=1)  # (8, 2)
 _VISIBLE = 0.1  # of the image that must be untouched to level a map by it
 _CALM = 0.02  # slope below which gel may tell about the lamps
+_FIRST_ROUNDS = 6
 _LEANS = 0.06  # slope below which gel, pressed in or not, may tell about a gain common to the lamps
 _NOISE_M = 12e-6  # of a marker's depth, wherever it lies
 _DEPTH_SHARE = 0.03  # of the depth: what a network errs by in scale on another gel of the same make
@@ -72,11 +73,18 @@ class FullDepth:
             uv_px: (n, 2) centres of the dots.
         """
         ratio = np.asarray(self._shrink(image.astype(np.float32)) / self._floor, dtype=np.float32)
-        if self._calm is None:  # first frame: nobody has said yet where the gel is calm
+        if self._calm is None:  # first frame: calm gel, gain and tilt are found together
             self._measure(ratio, mask, uv_px)
+            for _ in range(_FIRST_ROUNDS):
+                self._lamps.forget()
+                self._level.forget()
+                self._measure(self._lit(ratio, mask), mask, uv_px)
+        return self._measure(self._lit(ratio, mask), mask, uv_px)
+
+    def _lit(self, ratio: Float32Map, mask: BoolArray) -> Float32Map:
+        """A ratio image (h, w, 3) as if the lamps had not changed."""
         assert self._calm is not None
-        ratio = self._lamps.correct(ratio, self._calm & ~mask, self._lean_little & ~mask)
-        return self._measure(ratio, mask, uv_px)
+        return self._lamps.correct(ratio, self._calm & ~mask, self._lean_little & ~mask)
 
     def _measure(self, ratio: Float32Map, mask: BoolArray, uv_px: FloatArray) -> DepthMap:
         """Depth from a ratio image (h, w, 3) that lamps no longer disturb; remembers slopes and calm gel."""

@@ -25,6 +25,7 @@ _PROBE = 0.03  # change of a channel's ratio by which the network's sensitivity 
 _TILT_SIGMA = 10e-3  # what lamps and network may tilt a depth map by, m/m
 _LEVEL_SIGMA_M = 10e-6  # how far untouched gel may lie from 0 beside a contact
 _INDEPENDENT = 4.0  # untouched gel counts as so many independent measurements
+_THIN = 4  # every so many pixels take part in the plane
 _TILT_RATE = 0.1  # of a new frame's tilt in the mean
 
 
@@ -67,6 +68,10 @@ class LampGain:
             else:
                 self._from_flat(ratio, flat)
         return np.asarray(ratio / self.gain.astype(np.float32), dtype=np.float32)
+
+    def forget(self) -> None:
+        """Start anew with the next image."""
+        self._first = None
 
     def _from_flat(self, ratio: Float32Map, flat: BoolArray) -> None:
         means, good = self._blocks(ratio, flat)
@@ -133,11 +138,15 @@ class Level:
             zero = np.percentile(np.concatenate([z[0], z[-1], z[:, 0], z[:, -1]]), 10)
         return np.asarray(z - zero, dtype=np.float32)
 
+    def forget(self) -> None:
+        """Start anew with the next map."""
+        self._tilt = None
+
     def _plane(self, h: Float32Map, untouched: BoolArray) -> FloatArray:
         """Tilt (2,) of the robust plane, with a prior of zero: gel seen on one side only hardly tilts the rest."""
-        v, u = np.nonzero(untouched[::2, ::2])
-        z = h[::2, ::2][v, u].astype(np.float64)
-        A = np.stack([np.ones(len(v)), self._x[2 * u], self._y[2 * v]], axis=1)  # (n, 3)
+        v, u = np.nonzero(untouched[::_THIN, ::_THIN])
+        z = h[::_THIN, ::_THIN][v, u].astype(np.float64)
+        A = np.stack([np.ones(len(v)), self._x[_THIN * u], self._y[_THIN * v]], axis=1)  # (n, 3)
         prior = np.diag([0.0, 1.0, 1.0]) * (_LEVEL_SIGMA_M / _TILT_SIGMA) ** 2 / _INDEPENDENT
         w = np.ones(len(v))
         x: FloatArray = np.zeros(3)
