@@ -37,6 +37,10 @@ class OutputError(TipTraceError):
     """Results that cannot be written, or read back."""
 
 
+class DeviceError(TipTraceError):
+    """A camera or robot that is missing, busy, silent, or not what the rig file says."""
+
+
 class MissingExtraError(TipTraceError):
     """An optional library is not installed."""
 

@@ -1,0 +1,75 @@
+"""Rates, jitter and fault counts of a device; shared by its thread and whoever asks."""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter, deque
+from itertools import pairwise
+
+import numpy as np
+
+from tiptrace.drivers.base import DeviceHealth, DeviceStatus
+from tiptrace.drivers.timeline import NS, Timeline
+
+_WINDOW = 256
+
+
+class Meter:
+    """What :class:`DeviceHealth` reports.
+
+    Args:
+        name: Of the device.
+        timeline: The session's.
+        stale_s: Silence that counts as stale.
+    """
+
+    def __init__(self, name: str, timeline: Timeline, stale_s: float) -> None:
+        self.name = name
+        self._timeline, self._stale_s = timeline, stale_s
+        self._lock = threading.Lock()
+        self._stamps: deque[int] = deque(maxlen=_WINDOW)
+        self._last_arrival: int | None = None
+        self._count = 0
+        self._faults: Counter[str] = Counter()
+        self._status, self._detail = DeviceStatus.STARTING, ""
+
+    def good(self, stamp_ns: int, arrived_ns: int) -> None:
+        """A new sample was delivered."""
+        with self._lock:
+            if self._stamps and stamp_ns - self._stamps[-1] > 2 * NS:
+                self._stamps.clear()  # the rate after a pause is the rate since it
+            self._stamps.append(stamp_ns)
+            self._last_arrival = arrived_ns
+            self._count += 1
+            self._status, self._detail = DeviceStatus.OK, ""
+
+    def bad(self, status: DeviceStatus, detail: str, count_as: str | None = None) -> None:
+        """Something else was."""
+        with self._lock:
+            self._status, self._detail = status, detail
+            self._faults[count_as or status.value] += 1
+
+    def fault(self, kind: str, count: int = 1) -> None:
+        """Count a fault that does not change the status."""
+        with self._lock:
+            self._faults[kind] += count
+
+    def faults(self, kind: str) -> int:
+        """How often a fault was seen."""
+        with self._lock:
+            return self._faults[kind]
+
+    def health(self) -> DeviceHealth:
+        """State at this moment."""
+        with self._lock:
+            stamps, count, faults = list(self._stamps), self._count, tuple(sorted(self._faults.items()))
+            status, detail, last = self._status, self._detail, self._last_arrival
+        age_s = None if last is None else (self._timeline.now_ns() - last) / NS
+        if status is DeviceStatus.OK and age_s is not None and age_s > self._stale_s:
+            status, detail = DeviceStatus.STALE, f"{self.name}: nothing new for {age_s:.1f} s"
+        rate_hz = jitter_ms = None
+        if len(stamps) > 2:
+            steps_s = np.array([b - a for a, b in pairwise(stamps)]) / NS
+            rate_hz = float(1.0 / max(float(steps_s.mean()), 1e-9))
+            jitter_ms = float(steps_s.std() * 1e3)
+        return DeviceHealth(self.name, status, detail, count, rate_hz, jitter_ms, age_s, faults)

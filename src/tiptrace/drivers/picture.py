@@ -1,0 +1,146 @@
+"""From what a camera sends to the image that the rig means; damaged pictures are refused."""
+
+from __future__ import annotations
+
+import zlib
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tiptrace.config import Sensor
+from tiptrace.errors import DeviceError
+from tiptrace.types import Image
+
+JPEG_QUALITY = 95
+_FLIP = {"horizontal": 1, "vertical": 0, "both": -1}
+_BLOCKS = (16, 12)  # of which the picture's means are compared, x and y
+_BLOCK_STEP = 40.0  # grey levels by which a block's mean may change between two frames
+_MANY_BLOCKS = 3
+
+
+class PictureError(ValueError):
+    """A picture that is cut off or damaged; the text says how."""
+
+
+def decode_jpeg(data: bytes) -> Image:
+    """A whole jpeg → (height, width, 3) BGR.
+
+    OpenCV fills what is missing with grey and says nothing, so the frame of the file is checked first: it must begin
+    and end as a jpeg does, and its scan must hold no marker but restarts.
+
+    Raises:
+        PictureError: cut off, or no jpeg.
+    """
+    if data[:2] != b"\xff\xd8":
+        raise PictureError("does not begin as a jpeg")
+    end = data.rstrip(b"\x00")  # cameras pad
+    if end[-2:] != b"\xff\xd9":
+        raise PictureError("is cut off")
+    _check_scan(end)
+    try:
+        image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_COLOR)
+    except cv2.error:
+        image = None
+    if image is None:
+        raise PictureError("cannot be decoded")
+    return np.asarray(image, dtype=np.uint8)
+
+
+def _check_scan(data: bytes) -> None:
+    """No marker but stuffing and restarts between the first scan's header and the end."""
+    start = data.find(b"\xff\xda")
+    if start < 0:
+        raise PictureError("has no picture in it")
+    scan = np.frombuffer(data, dtype=np.uint8)[start + 2 : -2]
+    after = scan[1:][scan[:-1] == 0xFF]
+    strange = (after != 0) & ((after < 0xD0) | (after > 0xD7)) & (after != 0xFF)
+    if np.any(strange) and b"\xff\xc2" not in data[:start]:  # progressive files have several scans
+        raise PictureError("holds bytes that no jpeg has")
+
+
+def encode_jpeg(image: Image) -> bytes:
+    """(height, width, 3) BGR → jpeg, as recordings hold it."""
+    _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    return data.tobytes()
+
+
+class Framing:
+    """Crop, flip and size of one finger's images.
+
+    Args:
+        sensor: What the rig says; ``camera`` may be absent.
+    """
+
+    def __init__(self, sensor: Sensor) -> None:
+        camera = sensor.camera
+        self.size_px = tuple(sensor.image_size_px)
+        self.source_px = tuple(camera.size_px) if camera and camera.size_px else None
+        self._crop_px = camera.crop_px if camera else None
+        self._flip = _FLIP.get((camera.flip if camera else None) or "none")
+
+    def unchanged(self, image: Image) -> bool:
+        """Whether an image is already what the rig means."""
+        return self._crop_px is None and self._flip is None and _size(image) == self.size_px
+
+    def check(self, name: str, image: Image) -> None:
+        """The camera must send the size that was asked for, and the crop must lie in it.
+
+        Raises:
+            DeviceError: another size.
+        """
+        W, H = _size(image)
+        if self.source_px is not None and self.source_px != (W, H):
+            raise DeviceError(
+                f"{name}: sends {W}x{H} px, the rig file asks for {self.source_px[0]}x{self.source_px[1]}: set "
+                "camera.size_px to a size that the camera has (crop_px and mm_per_px belong to it)"
+            )
+        if self._crop_px is not None:
+            left, top, width, height = self._crop_px
+            if min(left, top) < 0 or min(width, height) < 1 or left + width > W or top + height > H:
+                raise DeviceError(
+                    f"{name}: camera.crop_px {list(self._crop_px)} (left, top, width, height) lies outside the "
+                    f"image of {W}x{H} px: correct the rig file"
+                )
+
+    def apply(self, image: Image) -> Image:
+        """Crop, flip, resize: (h, w, 3) BGR in, (height, width, 3) as the rig means out."""
+        if self._crop_px is not None:
+            left, top, width, height = self._crop_px
+            image = image[top : top + height, left : left + width]
+        if self._flip is not None:
+            image = np.asarray(cv2.flip(image, self._flip), dtype=np.uint8)
+        if _size(image) != self.size_px:
+            image = np.asarray(cv2.resize(image, self.size_px, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+        return np.ascontiguousarray(image)
+
+
+class Novelty:
+    """Tells whether a picture is new, and whether it can follow the one before."""
+
+    def __init__(self) -> None:
+        self._print: int | None = None
+        self._blocks: NDArray[Any] | None = None
+
+    def repeated(self, data: bytes | Image) -> bool:
+        """Whether these bytes or pixels are those of the picture before; a sensor's noise never repeats."""
+        mark = zlib.crc32(memoryview(data))
+        same = mark == self._print
+        self._print = mark
+        return same
+
+    def torn(self, image: Image) -> bool:
+        """Whether parts of the picture jumped, as after a damaged byte, where a gel deforms gradually.
+
+        A jump that stays is taken at its second frame: lamps may be switched.
+        """
+        blocks = cv2.resize(image, _BLOCKS, interpolation=cv2.INTER_AREA).astype(np.float32)
+        last, self._blocks = self._blocks, blocks
+        if last is None:
+            return False
+        return int((np.abs(blocks - last).max(axis=2) > _BLOCK_STEP).sum()) >= _MANY_BLOCKS
+
+
+def _size(image: Image) -> tuple[int, int]:
+    return image.shape[1], image.shape[0]

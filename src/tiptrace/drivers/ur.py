@@ -1,0 +1,196 @@
+"""Universal Robots through RTDE, receive only (extra ``ur``)."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import socket
+import threading
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+import numpy as np
+
+from tiptrace.drivers.base import Closing, DeviceHealth, DeviceStatus, PoseFrames, RobotSample, Wake
+from tiptrace.drivers.sample_queue import SampleQueue
+from tiptrace.drivers.timeline import NS, ClockMap, Timeline
+from tiptrace.errors import ConfigError, DeviceError, MissingExtraError
+from tiptrace.geometry.transforms import rotation_exp, transform
+from tiptrace.types import OpeningSample, PoseSample
+
+_PORT = 30004
+_REACH_S = 1.5
+_FIRST_POSE_S = 5.0
+_POLL_S = 0.001
+_SILENCE_S = 0.5
+_BACK_OFF_S = (0.1, 1.0)
+
+
+class UrRobot(Closing):
+    """Poses of the active TCP in the controller's ``base`` frame, as RTDE sends them.
+
+    What the receive interface cannot tell is whether the active TCP is the flange: the rig file has to say
+    ``end_effector: tcp``. Stamps are the controller's own, brought to the session's timeline by the least delay.
+
+    Args:
+        uri: ``ur://HOST``, with ``?opening_register=N`` where an output double register holds the gripper's opening, m.
+        timeline: The session's.
+
+    Raises:
+        MissingExtraError: ur-rtde is not installed.
+    """
+
+    def __init__(self, uri: str, timeline: Timeline) -> None:
+        parts = urlsplit(uri)
+        if not parts.hostname:
+            raise ConfigError(f"{uri}: names no robot; expected ur://HOST")
+        self._host = parts.hostname
+        self._register = _register(uri, parts.query)
+        self.name = f"ur://{self._host}"
+        try:
+            self._library: Any = importlib.import_module("rtde_receive")
+        except ImportError:
+            raise MissingExtraError("ur-rtde", "ur") from None
+        self._timeline = timeline
+        self._queue = SampleQueue(self.name, timeline)
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._clock = ClockMap()
+
+    @property
+    def frames(self) -> PoseFrames:
+        """The controller's base, the active TCP."""
+        return PoseFrames("base", "tcp")
+
+    def start(self, wake: Wake) -> None:
+        """Connect and wait for the first pose."""
+        self._queue.wake = wake
+        receiver = self._connect()
+        self._thread = threading.Thread(
+            target=self._run, args=(receiver,), name=f"robot {self.name}", daemon=True
+        )
+        self._thread.start()
+        if not self._queue.first.wait(_FIRST_POSE_S):
+            self.close()
+            raise DeviceError(
+                f"{self.name}: connected, but no pose within {_FIRST_POSE_S:g} s: is the arm powered on?"
+            )
+
+    def take(self) -> list[RobotSample]:
+        """Samples since the last call."""
+        return self._queue.take()
+
+    def health(self) -> DeviceHealth:
+        """State at this moment."""
+        return self._queue.health()
+
+    def close(self) -> None:
+        """Disconnect."""
+        self._stop.set()
+        if self._thread is not None:
+            self._thread.join(timeout=3.0)
+            self._thread = None
+
+    # --- the thread ----------------------------------------------------------------------------------------
+
+    def _run(self, receiver: Any) -> None:
+        while not self._stop.is_set():
+            reason = self._receive(receiver)
+            if self._stop.is_set():
+                break
+            self._queue.meter.bad(DeviceStatus.LOST, f"{self.name}: {reason}")
+            _drop(receiver)
+            receiver = self._reconnect()
+        if receiver is not None:
+            _drop(receiver)
+
+    def _receive(self, receiver: Any) -> str:
+        """Deliver poses until the connection is gone; why it is."""
+        last_s, last_ns = -1.0, self._timeline.now_ns()
+        while not self._stop.is_set():
+            stamp_s = float(receiver.getTimestamp())
+            now_ns = self._timeline.now_ns()
+            if stamp_s == last_s:
+                if now_ns - last_ns > _SILENCE_S * NS:
+                    return f"silent for {_SILENCE_S:g} s" if receiver.isConnected() else "disconnected"
+                self._stop.wait(_POLL_S)
+                continue
+            pose = receiver.getActualTCPPose()
+            if float(receiver.getTimestamp()) == stamp_s and stamp_s > 0.0:  # else they are of two instants
+                if stamp_s < last_s:
+                    self._queue.meter.fault("clock-jump")
+                self._deliver(self._clock.stamp_ns(round(stamp_s * NS), now_ns), pose, receiver)
+                last_s, last_ns = stamp_s, now_ns
+            self._stop.wait(_POLL_S)
+        return "stopped"
+
+    def _deliver(self, stamp_ns: int, pose: list[float], receiver: Any) -> None:
+        x = np.asarray(pose, dtype=np.float64)  # (6,) m, rotation vector
+        if x.shape != (6,) or not np.all(np.isfinite(x)):
+            self._queue.meter.fault("garbled")
+            return
+        self._queue.put(PoseSample(stamp_ns, transform(rotation_exp(x[3:]), x[:3])))
+        if self._register is not None:
+            opening_m = float(receiver.getOutputDoubleRegister(self._register))
+            if 0.0 <= opening_m <= 0.3:
+                self._queue.put(OpeningSample(stamp_ns, opening_m))
+            else:
+                self._queue.meter.fault("garbled")
+
+    def _connect(self) -> Any:
+        """A receiver.
+
+        Raises:
+            DeviceError: unreachable, or no RTDE there.
+        """
+        remedy = "check the address, that the arm is on, and that the network cable is plugged in"
+        try:
+            socket.create_connection((self._host, _PORT), timeout=_REACH_S).close()
+        except OSError as error:
+            why = getattr(error, "strerror", None) or str(error)
+            raise DeviceError(
+                f"{self.name}: robot cannot be reached on port {_PORT} ({why}): {remedy}"
+            ) from None
+        variables = ["timestamp", "actual_TCP_pose"]
+        upper = self._register is not None and self._register > 23
+        if self._register is not None:
+            variables.append(f"output_double_register_{self._register}")
+        try:
+            return self._library.RTDEReceiveInterface(self._host, -1.0, variables, False, upper)
+        except Exception as error:  # noqa: BLE001  the binding raises what C++ throws
+            raise DeviceError(f"{self.name}: answers, but not as RTDE ({error}): {remedy}") from None
+
+    def _reconnect(self) -> Any:
+        wait_s, most_s = _BACK_OFF_S
+        while not self._stop.is_set():
+            try:
+                receiver = self._connect()
+            except DeviceError as error:
+                self._queue.meter.bad(DeviceStatus.LOST, str(error), "reconnect-failed")
+            else:
+                self._clock = ClockMap()
+                return receiver
+            self._stop.wait(wait_s)
+            wait_s = min(2.0 * wait_s, most_s)
+        return None
+
+
+def _register(uri: str, query: str) -> int | None:
+    values = parse_qs(query)
+    unknown = set(values) - {"opening_register"}
+    if unknown:
+        raise ConfigError(f"{uri}: unknown option {sorted(unknown)[0]!r}; valid: opening_register")
+    if not values:
+        return None
+    try:
+        register = int(values["opening_register"][0])
+    except ValueError:
+        register = -1
+    if not 0 <= register <= 47:
+        raise ConfigError(f"{uri}: opening_register is the number of an output double register, 0 to 47")
+    return register
+
+
+def _drop(receiver: Any) -> None:
+    with contextlib.suppress(Exception):
+        receiver.disconnect()
