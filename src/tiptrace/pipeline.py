@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Protocol
 
-from tiptrace.errors import RecordingError
+from tiptrace.errors import PerceptionError, RecordingError
 from tiptrace.streams.sync_report import SyncReport
-from tiptrace.streams.synchronise import synchronise
+from tiptrace.streams.synchronise import SyncSettings, synchronise
 from tiptrace.tracer import TipTracer, make_tracer
 from tiptrace.types import Observation, Phase, SensedPair, Stream, TipEstimate, TipTrajectory
 
@@ -49,8 +49,15 @@ class NullViewer:
         """Do nothing."""
 
 
+BadPair = Callable[[Observation, PerceptionError], None]
+
+
 def trace(
-    stream: Stream, tracer: TipTracer, viewer: Viewer | None = None, report: SyncReport | None = None
+    stream: Stream,
+    tracer: TipTracer,
+    viewer: Viewer | None = None,
+    report: SyncReport | None = None,
+    settings: SyncSettings | None = None,
 ) -> TipTrajectory:
     """Run a tracer over a stream.
 
@@ -59,6 +66,7 @@ def trace(
         tracer: The method.
         viewer: Watches.
         report: Collects what synchronisation dropped and why.
+        settings: Limits of synchronisation.
 
     Returns:
         An estimate for every pair, in order; ``loop_ms`` includes acquisition or decoding.
@@ -68,19 +76,47 @@ def trace(
     """
     viewer, report = viewer or NullViewer(), report or SyncReport()
     trajectory = TipTrajectory()
-    for observation, acquired_ms in _timed(synchronise(stream, report=report)):
+    for step in steps(stream, tracer, report, settings):
+        trajectory.append(step.estimate)
+        viewer.show(step)
+    _finish(trajectory, tracer)
+    trajectory.events = sorted([*trajectory.events, *report.gaps], key=lambda event: event.start_ns)
+    return trajectory
+
+
+def steps(
+    stream: Stream,
+    tracer: TipTracer,
+    report: SyncReport | None = None,
+    settings: SyncSettings | None = None,
+    on_bad_pair: BadPair | None = None,
+) -> Iterator[Step]:
+    """The loop, turn by turn, in constant memory.
+
+    Args:
+        stream: Where samples come from.
+        tracer: The method.
+        report: Collects what synchronisation dropped and why.
+        settings: Limits of synchronisation.
+        on_bad_pair: Told of a pair whose images cannot be used, which is then left out; without it that ends the loop.
+
+    Raises:
+        PerceptionError: images that cannot be used, and nobody to tell.
+    """
+    for observation, acquired_ms in _timed(synchronise(stream, settings, report)):
         start = time.perf_counter()
-        sensed = tracer.sensing(observation)
+        try:
+            sensed = tracer.sensing(observation)
+        except PerceptionError as error:
+            if on_bad_pair is None:
+                raise
+            on_bad_pair(observation, error)
+            continue
         middle = time.perf_counter()
         estimate = tracer.estimator.update(sensed)
         end = time.perf_counter()
         times_ms = (acquired_ms, (middle - start) * 1e3, (end - middle) * 1e3)
-        estimate = replace(estimate, loop_ms=sum(times_ms))
-        trajectory.append(estimate)
-        viewer.show(Step(observation, sensed, estimate, times_ms))
-    _finish(trajectory, tracer)
-    trajectory.events = sorted([*trajectory.events, *report.gaps], key=lambda event: event.start_ns)
-    return trajectory
+        yield Step(observation, sensed, replace(estimate, loop_ms=sum(times_ms)), times_ms)
 
 
 def replay(pairs: Iterable[SensedPair], tracer: TipTracer) -> TipTrajectory:

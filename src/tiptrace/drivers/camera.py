@@ -7,6 +7,8 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
+
 from tiptrace.drivers.base import Closing, DeviceHealth, DeviceStatus, Frame, Wake
 from tiptrace.drivers.meter import Meter
 from tiptrace.drivers.picture import Framing, Novelty, PictureError, decode_jpeg, encode_jpeg
@@ -200,8 +202,8 @@ class ThreadedCamera(Closing):
         self._wake()
 
     def _is_repeated(self, raw: RawFrame) -> bool:
-        data = raw.jpeg if raw.jpeg is not None else raw.image
-        assert data is not None
+        assert raw.jpeg is not None or raw.image is not None
+        data = raw.jpeg if raw.jpeg is not None else np.ascontiguousarray(raw.image).data
         if not self._novelty.repeated(data):
             self._repeats = 0
             return False

@@ -123,9 +123,9 @@ class Novelty:
         self._print: int | None = None
         self._blocks: NDArray[Any] | None = None
 
-    def repeated(self, data: bytes | Image) -> bool:
+    def repeated(self, data: bytes | memoryview) -> bool:
         """Whether these bytes or pixels are those of the picture before; a sensor's noise never repeats."""
-        mark = zlib.crc32(memoryview(data))
+        mark = zlib.crc32(data)
         same = mark == self._print
         self._print = mark
         return same

@@ -107,6 +107,12 @@ class FullEstimator:
         return self._anchoring
 
     @property
+    def running_covariance(self) -> FloatArray | None:
+        """(3, 3) m² of the tip as Stage I knows it so far, however badly; None before there is any."""
+        solution = self._running.solve()
+        return None if solution is None else solution[1]
+
+    @property
     def tip_E(self) -> TipPrior | None:
         """The tip in F_E for another trial with the same grasp (``--anchor-from``); None without an anchor."""
         if self._anchoring is None or self._anchor is None:

@@ -59,6 +59,8 @@ class RecordingWriter:
         gel_models: ONNX files by the names under which the rig mentions them.
         image_format: ``jpeg`` or (ten times slower, lossless) ``png``.
         jpeg_quality: 0 to 100.
+        overwrite: Whether a target or an unfinished file of that name may be replaced.
+        chunk_bytes: What is buffered before it is handed to the file.
     """
 
     def __init__(
@@ -72,8 +74,11 @@ class RecordingWriter:
         gel_models: Mapping[str, bytes] | None = None,
         image_format: Literal["jpeg", "png"] = "jpeg",
         jpeg_quality: int = 95,
+        overwrite: bool = True,
+        chunk_bytes: int = _CHUNK_BYTES,
     ) -> None:
         self.path = path
+        self._overwrite, self._chunk_bytes = overwrite, chunk_bytes
         self.partial_path = path.with_name(f"{path.stem}.partial.mcap")
         self._base = rig.frames.base
         self._image_format = image_format
@@ -85,15 +90,21 @@ class RecordingWriter:
         self._writer: Any = None
 
     def __enter__(self) -> Self:
-        """Open the partial file and put the attachments first, so that a file cut off still has them."""
+        """Open the partial file and put the attachments first, so that a file cut off still has them.
+
+        Raises:
+            RecordingError: it cannot be opened, or is there already and must not be overwritten.
+        """
         from mcap_ros2.writer import Writer
 
+        if not self._overwrite:
+            self._refuse_to_overwrite()
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._file = self.partial_path.open("wb")
         except OSError as error:
             raise self._refused(error) from None
-        self._writer = Writer(self._file, chunk_size=_CHUNK_BYTES)
+        self._writer = Writer(self._file, chunk_size=self._chunk_bytes)
         for name, (media_type, data) in self._attachments.items():
             self._writer.add_attachment(0, 0, name, media_type, data)
         return self
@@ -113,8 +124,13 @@ class RecordingWriter:
         except OSError as error:
             raise self._refused(error) from None
 
-    def write(self, sample: Sample, *, log_time_ns: int | None = None) -> None:
+    def write(self, sample: Sample, *, log_time_ns: int | None = None, encoded: bytes | None = None) -> None:
         """Add one sample, logged at its own stamp unless told otherwise.
+
+        Args:
+            sample: What to write.
+            log_time_ns: The recorder's clock.
+            encoded: An image as it is to be stored, in the writer's format; else it is encoded here.
 
         Raises:
             RecordingError: a stamp before 1970, which the format cannot hold; a disk that is full.
@@ -122,7 +138,9 @@ class RecordingWriter:
         log_time_ns = sample.stamp_ns if log_time_ns is None else log_time_ns
         if min(sample.stamp_ns, log_time_ns) < 0:
             raise RecordingError(f"{self.path}: stamp {sample.stamp_ns} ns is negative; count from 1970")
-        topic, message_type, message = self._message(sample)
+        topic, message_type, message = (
+            self._message(sample) if encoded is None else self._stored(sample, encoded)
+        )
         if message_type not in self._schemas:
             text = messages.schema_text(message_type)
             self._schemas[message_type] = self._writer.register_msgdef(message_type, text)
@@ -134,8 +152,35 @@ class RecordingWriter:
         except OSError as error:
             raise self._refused(error) from None
 
+    def sync(self, note: Mapping[str, str] | None = None) -> None:
+        """Put on the disk what was written, up to the last whole chunk; ``note`` is kept as metadata ``sync``.
+
+        Raises:
+            RecordingError: the disk is full.
+        """
+        assert self._file is not None
+        try:
+            if note is not None:
+                self._writer.add_metadata("sync", dict(note))
+            self._file.flush()
+            os.fsync(self._file.fileno())
+        except OSError as error:
+            raise self._refused(error) from None
+
+    def _refuse_to_overwrite(self) -> None:
+        for path in (self.path, self.partial_path):
+            if path.exists():
+                raise RecordingError(f"{path}: exists already; move it away, or give another name")
+
     def _refused(self, error: OSError) -> RecordingError:
         return RecordingError(f"{self.partial_path}: cannot be written ({error.strerror})")
+
+    def _stored(self, sample: Sample, encoded: bytes) -> tuple[str, str, dict[str, Any]]:
+        """The same for an image that is encoded already."""
+        assert isinstance(sample, ImageSample)
+        header = messages.header_message(sample.stamp_ns, FRAME_ID[sample.side])
+        message = {"header": header, "format": self._image_format, "data": encoded}
+        return IMAGE_TOPIC[sample.side], "sensor_msgs/msg/CompressedImage", message
 
     def _message(self, sample: Sample) -> tuple[str, str, dict[str, Any]]:
         """Topic, type and content of a sample."""
