@@ -29,7 +29,8 @@ MAY_IMPORT = {
     "batch": BASE
     | {"batch_plan", "evaluation", "frames", "outputs", "reconstruction", "streams", "trial_runs"},
     "export": BASE | {"batch_plan", "frames", "outputs", "pipeline", "streams", "tracer"},
-    "live": BASE | {"geometry", "drivers", "streams", "tracer", "pipeline", "calibration"},
+    "live": BASE
+    | {"geometry", "drivers", "streams", "perception", "estimation", "tracer", "pipeline", "calibration"},
     "trial_plan": BASE | {"evaluation", "sim", "trial_runs"},
     "reconstruction": BASE
     | {"estimation", "evaluation", "geometry", "outputs", "pipeline", "streams", "tracer"},

@@ -1,0 +1,238 @@
+"""Two cameras and a robot as a stream, like a recording or a simulation."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack
+from dataclasses import replace
+from types import TracebackType
+from typing import Protocol, Self
+
+from tiptrace.config import Frames, Rig, Tool
+from tiptrace.drivers.base import Camera, DeviceHealth, DeviceStatus, Frame, PoseFrames, Robot
+from tiptrace.drivers.timeline import Timeline
+from tiptrace.errors import ConfigError
+from tiptrace.streams.synchronise import LIVE, SyncSettings
+from tiptrace.types import SIDES, Image, ImageSample, OpeningSample, Phase, PhaseSample, Sample, Side
+
+_IDLE_S = 0.2
+_WARM_UP_S, _WARM_UP_FRAMES = 2.0, 8
+_SPACING_SHARE = 0.85  # of the measured period between frames: closer ones do not come
+_ARRIVALS = 64
+_ENDED_GRACE_S = 0.5
+
+
+class Tap(Protocol):
+    """Sees every sample on its way to the loop."""
+
+    def __call__(self, sample: Sample, log_time_ns: int, jpeg: bytes | None) -> None:
+        """Take a sample, when it was handed over, and an image's bytes."""
+        ...
+
+
+class LiveStream:
+    """Implements ``types.Stream``; a context manager that opens and closes the devices.
+
+    Args:
+        rig: What the user believes about the rig.
+        cameras: One per finger, not yet started.
+        robot: Not yet started.
+        timeline: The one that the devices stamp by.
+        tool: What is known of the tool.
+        references: Images of the untouched gels.
+        gel_models: ONNX files by the names under which the rig mentions them.
+        standby: Deliver nothing before the first phase mark.
+
+    Attributes:
+        settings: Limits of synchronisation that suit these cameras; final after entering.
+        first_images: An image of each finger, after entering.
+        tap: Sees every sample on its way to the loop, as a recorder does.
+        on_idle: Called several times a second from the loop.
+        on_phase: Takes the phase marks that come with the robot's topics; without it they are delivered as they are.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        cameras: Mapping[Side, Camera],
+        robot: Robot,
+        timeline: Timeline,
+        *,
+        tool: Tool | None = None,
+        references: Mapping[Side, Image] | None = None,
+        gel_models: Mapping[str, bytes] | None = None,
+        standby: bool = False,
+    ) -> None:
+        self.rig, self.tool, self.timeline = rig, tool, timeline
+        self.references: dict[Side, Image] = dict(references or {})
+        self.gel_models: dict[str, bytes] = dict(gel_models or {})
+        self.settings: SyncSettings = LIVE
+        self.first_images: dict[Side, Image] = {}
+        self.standby = standby
+        self.tap: Tap | None = None
+        self.on_idle: Callable[[], None] | None = None
+        self.on_phase: Callable[[Phase], None] | None = None
+        self._cameras, self._robot = dict(cameras), robot
+        self._wake, self._stop = threading.Event(), threading.Event()
+        self._lock = threading.Lock()
+        self._marks: list[Phase] = []
+        self._arrived: OrderedDict[tuple[Side, int], int] = OrderedDict()
+        self._devices = ExitStack()
+
+    # --- opening and closing -------------------------------------------------------------------------------
+
+    def __enter__(self) -> Self:
+        """Start the devices and measure the cameras' rate.
+
+        Raises:
+            DeviceError: one of them is missing, busy or silent.
+            ConfigError: the robot's pose is not what the rig file means.
+        """
+        with ExitStack() as opened:
+            check_frames(self._robot.frames, self.rig.frames)
+            opened.callback(self._robot.close)
+            self._robot.start(self._wake.set)
+            for side in SIDES:
+                opened.callback(self._cameras[side].close)
+                self._cameras[side].start(self._wake.set)
+            self._warm_up()
+            check_frames(self._robot.frames, self.rig.frames)
+            self._devices = opened.pop_all()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+        self._devices.close()
+
+    def _warm_up(self) -> None:
+        """Keep an image of each finger, learn the time between frames, and drop what waited."""
+        end = time.monotonic() + _WARM_UP_S
+        while time.monotonic() < end:
+            for side in SIDES:
+                for frame in self._cameras[side].take():
+                    self.first_images[side] = frame.image
+            if all(self._cameras[side].health().count >= _WARM_UP_FRAMES for side in SIDES):
+                break
+            time.sleep(0.02)
+        rates = [self._cameras[side].health().rate_hz for side in SIDES]
+        known = [rate for rate in rates if rate is not None]
+        if len(known) == 2:
+            self.settings = replace(LIVE, min_frame_spacing_s=_SPACING_SHARE / max(known))
+        self._robot.take()
+
+    # --- control, from any thread --------------------------------------------------------------------------
+
+    def stop(self) -> None:
+        """End the stream; samples already here are still delivered."""
+        self._stop.set()
+        self._wake.set()
+
+    def mark(self, phase: Phase) -> None:
+        """From now on the trial is in ``phase``."""
+        with self._lock:
+            self._marks.append(phase)
+        self._wake.set()
+
+    def health(self) -> dict[str, DeviceHealth]:
+        """State of ``left``, ``right`` and ``robot``."""
+        found = {str(side): camera.health() for side, camera in self._cameras.items()}
+        return {**found, "robot": self._robot.health()}
+
+    def arrived_ns(self, side: Side, stamp_ns: int) -> int | None:
+        """When the last byte of an image was here; known for the last few seconds."""
+        return self._arrived.get((side, stamp_ns))
+
+    # --- the stream ----------------------------------------------------------------------------------------
+
+    def __iter__(self) -> Iterator[Sample]:
+        """Deliver samples as they come, until :meth:`stop` or the end of a replay.
+
+        Raises:
+            DeviceError: a device that is no longer what it was at the start.
+            ConfigError: a pose that is no longer what the rig file means.
+        """
+        ended_at: float | None = None
+        while True:
+            stopping = self._stop.is_set()
+            if not stopping:
+                self._wake.wait(_IDLE_S)
+                self._wake.clear()
+            samples = self._gather()
+            if not self.standby:
+                for sample, jpeg in samples:
+                    if self.tap is not None:
+                        self.tap(sample, self._log_time_ns(sample), jpeg)
+                    yield sample
+            if stopping:
+                return
+            if self.on_idle is not None:
+                self.on_idle()
+            if self._ended():
+                ended_at = ended_at or time.monotonic()
+                if time.monotonic() - ended_at > _ENDED_GRACE_S:
+                    return
+
+    def _gather(self) -> list[tuple[Sample, bytes | None]]:
+        """What has come: marks and poses first, so that an image finds them there."""
+        found: list[tuple[Sample, bytes | None]] = []
+        frames: list[tuple[int, Side, Frame]] = []
+        for side in SIDES:
+            frames += [(frame.arrived_ns, side, frame) for frame in self._cameras[side].take()]
+        poses = self._robot.take()
+        check_frames(self._robot.frames, self.rig.frames)
+        if self.on_phase is not None:
+            for sample in poses:
+                if isinstance(sample, PhaseSample):
+                    self.on_phase(sample.phase)
+            poses = [sample for sample in poses if not isinstance(sample, PhaseSample)]
+        with self._lock:
+            marks, self._marks = self._marks, []
+        for phase in marks:
+            found.append((PhaseSample(self.timeline.now_ns(), phase), None))
+            self.standby = False
+        found += [(sample, None) for sample in poses]
+        for arrived_ns, side, frame in sorted(frames, key=lambda item: item[0]):
+            self._arrived[side, frame.stamp_ns] = arrived_ns
+            found.append((ImageSample(side, frame.stamp_ns, frame.image), frame.jpeg))
+        while len(self._arrived) > _ARRIVALS:
+            self._arrived.popitem(last=False)
+        return found
+
+    def _log_time_ns(self, sample: Sample) -> int:
+        """What has no header is dated by it; so live and recorded marks are the same."""
+        if isinstance(sample, PhaseSample | OpeningSample):
+            return sample.stamp_ns
+        return self.timeline.now_ns()
+
+    def _ended(self) -> bool:
+        return any(health.status is DeviceStatus.ENDED for health in self.health().values())
+
+
+def check_frames(pose: PoseFrames, rig: Frames) -> None:
+    """The robot's pose must be the one that the rig file means.
+
+    Raises:
+        ConfigError: another base, or the pose of another frame.
+    """
+    if pose.base is not None and pose.base.strip("/") != rig.base.strip("/"):
+        turned = {pose.base.strip("/"), rig.base.strip("/")} == {"base", "base_link"}
+        raise ConfigError(
+            f"the robot's pose is given in {pose.base!r}, frames.base of the rig file is {rig.base!r}"
+            + (", which is turned by 180° about z" if turned else "")
+            + ": correct the rig file, or publish the pose that it means"
+        )
+    if pose.end_effector is not None and pose.end_effector.strip("/") != rig.end_effector.strip("/"):
+        raise ConfigError(
+            f"the robot's pose is that of {pose.end_effector!r}, frames.end_effector of the rig file is "
+            f"{rig.end_effector!r}: T_E_S belongs to one of them; "
+            + (
+                "make sure that T_E_S is given in the TCP frame that is active on the arm, and write end_effector: tcp"
+                if pose.end_effector == "tcp"
+                else "correct the rig file, or publish the pose that it means"
+            )
+        )
