@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from itertools import groupby
 from pathlib import Path
@@ -20,14 +21,16 @@ from tiptrace.evaluation.runner import TrialRun, TrialTask
 from tiptrace.evaluation.suite_tables import BASELINES
 from tiptrace.evaluation.truth import Truth
 from tiptrace.evaluation.truth_files import read_truth
-from tiptrace.pipeline import Step, open_tracer, replay, trace
+from tiptrace.pipeline import Step, replay, trace
 from tiptrace.reconstruction import Trial, reconstruct
 from tiptrace.sim.simulation import START_NS, Frame
 from tiptrace.sim.spec import make_spec
 from tiptrace.streams.simulated import SimulatedStream
 from tiptrace.streams.sources import open_recording
-from tiptrace.tracer import make_tracer
+from tiptrace.streams.sync_report import SyncReport
+from tiptrace.tracer import TruthAt, make_tracer, sensing_of
 from tiptrace.types import (
+    SIDES,
     Event,
     Image,
     Phase,
@@ -53,10 +56,9 @@ def run_trial(task: TrialTask, methods: Sequence[str]) -> TrialRun:
     stream, events = _open(source)
     task = described(task, stream.trial)
     samples = read_truth(Path(source["truth"])) if source.get("truth") else stream.truth()
-    found = _Traced(stream)
-    for method in methods:
-        found.add(method)
     truth = Truth.from_samples(samples) if samples else None
+    found = _Traced(stream, truth)
+    found.run(methods)
     analytic = _analytic(found, truth, source["analytic"], task) if source.get("analytic") else None
     return TrialRun(found.trajectories, truth, analytic, found.failures, events, task)
 
@@ -114,43 +116,92 @@ def described(task: TrialTask, trial: dict[str, Any]) -> TrialTask:
 
 @dataclass
 class _Traced:
-    """Trajectories of a stream, method by method. Baselines, which add no sensing, reuse the pairs of the first."""
+    """Trajectories of a stream, method by method.
+
+    Images are sensed once for each chain: what runs on the same one, as all baselines do, reuses its pairs.
+    """
 
     stream: Stream
+    truth: Truth | None = None
     trajectories: dict[str, TipTrajectory] = field(default_factory=dict)
     failures: dict[str, str] = field(default_factory=dict)
-    pairs: list[SensedPair] = field(default_factory=list)
-    poses: list[PoseSample] = field(default_factory=list)
+    _sensed: dict[str, _Sensed] = field(default_factory=dict)  # by chain
 
-    def add(self, method: str) -> None:
-        """Run a method; its failure is noted."""
+    @property
+    def poses(self) -> list[PoseSample]:
+        """The robot's poses, in order."""
+        chains = list(self._sensed.values())
+        return [pose for pair in chains[0].pairs for pose in pair.poses] if chains else []
+
+    def run(self, methods: Sequence[str]) -> None:
+        """Run methods, those with a loop rate of their own first; the failure of one is noted."""
+        for method in sorted(methods, key=lambda m: m in BASELINES):
+            try:
+                self.trajectories[method] = self._trajectory(method)
+            except TipTraceError as error:
+                self.failures[method] = str(error)
+        self.trajectories = {m: self.trajectories[m] for m in methods if m in self.trajectories}
+
+    def _trajectory(self, method: str) -> TipTrajectory:
+        chain = sensing_of(method)
+        sensed = self._sensed.get(chain)
+        if sensed is not None:
+            tracer = make_tracer(self.stream, method, truth_at=self._truth_at())
+            trajectory = replay(sensed.pairs, tracer)
+            trajectory.events = sorted([*trajectory.events, *sensed.gaps], key=lambda e: e.start_ns)
+            return trajectory
+        ending, watch, report = _Ending(self.stream), _Sensed(), SyncReport()
         try:
-            if method in BASELINES and self.pairs:
-                self.trajectories[method] = replay(self.pairs, make_tracer(self.stream, method))
-            else:
-                self.trajectories[method] = self._trace(method)
-        except TipTraceError as error:
-            self.failures[method] = str(error)
+            with ThreadPoolExecutor(len(SIDES), "finger") as pool:
+                tracer = make_tracer(self.stream, method, pool.map, self._truth_at())
+                return trace(ending, tracer, watch, report)
+        finally:
+            if ending.reached:  # also where the method refused the trial after all pairs
+                watch.gaps = list(report.gaps)
+                self._sensed[chain] = watch
 
-    def _trace(self, method: str) -> TipTrajectory:
-        watch = _Watch()
-        with open_tracer(self.stream, method) as tracer:
-            trajectory = trace(self.stream, tracer, watch)
-        if not self.pairs:
-            self.pairs, self.poses = watch.pairs, watch.poses
-        return trajectory
+    def _truth_at(self) -> TruthAt | None:
+        truth = self.truth
+        return None if truth is None else lambda stamp_ns: truth.nearest(stamp_ns)[0]
 
 
 @dataclass
-class _Watch:
-    """Keeps what was sensed, and the robot's poses."""
+class _Sensed:
+    """What a chain sensed; a viewer of the loop."""
 
     pairs: list[SensedPair] = field(default_factory=list)
-    poses: list[PoseSample] = field(default_factory=list)
+    gaps: list[Event] = field(default_factory=list)
 
     def show(self, step: Step) -> None:
         self.pairs.append(step.sensed)
-        self.poses.extend(step.observation.poses)
+
+
+@dataclass
+class _Ending:
+    """A stream that knows whether it was read to its end."""
+
+    stream: Stream
+    reached: bool = False
+
+    @property
+    def rig(self) -> Rig:
+        return self.stream.rig
+
+    @property
+    def tool(self) -> Tool | None:
+        return self.stream.tool
+
+    @property
+    def references(self) -> dict[Side, Image]:
+        return self.stream.references
+
+    @property
+    def gel_models(self) -> dict[str, bytes]:
+        return self.stream.gel_models
+
+    def __iter__(self) -> Iterator[Sample]:
+        yield from self.stream
+        self.reached = True
 
 
 @dataclass

@@ -14,6 +14,7 @@ from tiptrace.cli.evaluate import evaluate
 from tiptrace.cli.simulate import simulate
 from tiptrace.errors import ConfigError
 from tiptrace.streams.recording import Recording
+from tiptrace.tracer import METHODS
 
 
 def run(*arguments: object) -> Result:
@@ -45,11 +46,12 @@ def test_an_unreadable_file_is_reported_and_the_rest_goes_on(recording: Path, tm
     assert result.exit_code == 1
     assert "given more than once" in " ".join(result.output.split())
     assert {r["trial"] for r in rows(out, "failures")} == {str(bad)}
-    paper, ee_only, published = rows(out, "overall")
-    assert (paper["method"], paper["trials"]) == ("paper", "1 of 2")
+    *ours, published = rows(out, "overall")
+    assert [r["method"] for r in ours] == list(METHODS)
+    assert {r["trials"] for r in ours} == {"1 of 2"}
     assert published["trajectory_rmse_mm"] == "8.59 ± 2.41"
-    assert ee_only["trajectory_rmse_mm"] != "–"
-    assert len(rows(out, "analytic")) == 2
+    assert all(r["trajectory_rmse_mm"] != "–" for r in ours)
+    assert len(rows(out, "analytic")) == len(METHODS)
     assert (out / "report.html").exists()
     assert (out / "trials.parquet").exists()
 

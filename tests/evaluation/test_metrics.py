@@ -9,7 +9,7 @@ from tiptrace.evaluation.metrics import CHI2_3_95, evaluate
 from tiptrace.evaluation.truth import Truth
 from tiptrace.types import Phase, Status, TipEstimate, TipTrajectory, TruthSample
 
-from .builders import START_NS, straight_truth, trajectory_of, truth_of
+from .builders import FRAME_NS, START_NS, straight_truth, trajectory_of, truth_of
 
 
 def test_a_perfect_trace_has_no_error():
@@ -167,3 +167,15 @@ def test_motion_of_the_tip_during_anchoring_is_told():
     p[2, 1] = 0.4e-3
     m = evaluate(trajectory_of(p, 5, anchor=p[0]), truth_of(p))
     assert m.anchoring_truth_motion_mm == pytest.approx(0.4)
+
+
+def test_a_truth_that_begins_within_the_latency_still_tells_the_start():
+    p = straight_truth()
+    late = truth_of(p)[1:]  # frame 0 lies one frame before the first sample
+    m = evaluate(trajectory_of(p, 5, anchor=[3e-3, 0, 4e-3]), late)
+    assert m.initial_contact_error_mm == pytest.approx(5.0)
+    truth = Truth.from_samples(late)
+    at, away_s = truth.nearest(START_NS)
+    assert (at, away_s) == (pytest.approx(p[0]), pytest.approx(FRAME_NS * 1e-9))
+    assert np.isnan(truth.nearest(START_NS - 10**9)[0]).all()
+    assert np.isnan(truth.at([START_NS])).all()  # nothing but the start is extrapolated

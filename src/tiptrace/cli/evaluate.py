@@ -28,7 +28,7 @@ def evaluate(
     ] = None,
     methods: Annotated[
         str, typer.Option(help="Methods, comma-separated, the main one first.")
-    ] = "paper,ee-only",
+    ] = "full,paper,ee-only,ee-oracle,nominal-tip,local-anchoring",
     out: Annotated[Path, typer.Option(help="Folder for tables, figures and report.html.")] = Path(
         "evaluation"
     ),
@@ -72,7 +72,7 @@ def evaluate(
 
       tiptrace evaluate --suite quick --out quick
 
-      tiptrace evaluate trials/ --methods paper,ee-only --workers 2 --out results
+      tiptrace evaluate trials/ --methods full,paper,ee-only --workers 2 --out results
 
       tiptrace evaluate mine.mcap --truth mocap.tum --analytic T3 --start 0.4,-0.1,0.02
     """
@@ -230,19 +230,23 @@ def _report(
 
 
 def _show(console: Any, records: list[TrialRecord], page: Path) -> None:
-    """Overall table with a row per metric, which fits a terminal; failures by name."""
+    """Errors by method, narrow enough for 80 columns; failures by name."""
+    from rich.box import SIMPLE_HEAD
     from rich.markup import escape
     from rich.table import Table
 
-    from tiptrace.evaluation.suite_tables import failures_table, overall_table
+    from tiptrace.evaluation.suite_tables import failures_table
+    from tiptrace.evaluation.terminal_table import terminal_table
 
-    overall = overall_table(records)
-    if overall.rows:
-        by_metric = list(zip([c.heading for c in overall.columns], *overall.text_rows(), strict=True))
-        table = Table(*(escape(cell) for cell in by_metric[0]), title=overall.title)
-        for row in by_metric[1:]:
-            table.add_row(*(escape(cell) for cell in row))
+    errors = terminal_table(records)
+    if errors.rows:
+        table = Table(title=escape(errors.title), box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+        for k, column in enumerate(errors.columns):
+            table.add_column(column.heading, justify="left" if k == 0 else "right", no_wrap=True)
+        for row in errors.text_rows():
+            table.add_row(*row)
         console.print(table)
+        console.print(errors.note, markup=False, highlight=False)
     for trial, method, reason in failures_table(records).text_rows():
-        console.print(f"failed: {trial}, {method}: {reason}", markup=False, highlight=False)
-    console.print(f"Report: {page}", markup=False, highlight=False)
+        console.print(f"failed: {trial}, {method}: {reason}", markup=False, highlight=False, soft_wrap=True)
+    console.print(f"Report: {page}", markup=False, highlight=False, soft_wrap=True)

@@ -111,15 +111,16 @@ def initial_point(trajectory: TipTrajectory, truth: Truth) -> tuple[FloatArray, 
     """p̂(0) and p^gt(0), (3,) m each.
 
     p̂(0) is the anchor, which belongs to frame 0, the first one in which the tool's motion is known; p^gt(0)
-    is the truth at that instant. Without an anchor (displacements only) both are taken at the first position
-    of the reconstruction segment. NaN where there is no such frame or no truth.
+    is the truth at that instant, or its first sample where that begins up to 0.25 s later. Without an anchor
+    (displacements only) both are taken at the first position of the reconstruction segment. NaN where there is no
+    such frame or no truth.
     """
     frame_0 = next((e for e in trajectory.estimates if e.R_B_E is not None), None)
     if trajectory.anchor is not None and frame_0 is not None:
-        return trajectory.anchor.p_B, truth.at([frame_0.stamp_ns])[0]
+        return trajectory.anchor.p_B, truth.nearest(frame_0.stamp_ns)[0]
     for e in trajectory.estimates:
         if e.phase is Phase.RECONSTRUCTION and e.p_B is not None:
-            return e.p_B, truth.at([e.stamp_ns])[0]
+            return e.p_B, truth.nearest(e.stamp_ns)[0]
     return np.full(3, np.nan), np.full(3, np.nan)
 
 

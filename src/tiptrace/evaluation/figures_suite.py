@@ -31,25 +31,49 @@ _MARKS = ("o", "s", "^", "D", "v", "P")
 
 def error_against_anchoring(records: Sequence[TrialRecord]) -> Figure:
     """Trajectory and shape RMSE against the initial contact error (the paper's error decomposition)."""
-    figure = style.new_figure(7.2, 3.4)
+    figure = style.new_figure(7.2, 4.2)
     panels = figure.subplots(1, 2)
     names = ("trajectory_rmse_mm", "shape_rmse_mm")
-    titles = ("Trajectory RMSE [mm]", "Shape RMSE [mm]")
+    titles = ("trajectory RMSE [mm]", "shape RMSE [mm]")
     for ax, name, title in zip(panels, names, titles, strict=True):
+        rhos = []
         for k, method in enumerate(methods_of(records)):
             contact = values_by_trial(records, method, "initial_contact_error_mm")
             error = values_by_trial(records, method, name)
             x, y = np.array(list(contact.values())), np.array([error[t] for t in contact])
+            if not np.any(x > 0):  # from the true anchor, or without any: nothing to hold against the other
+                continue
             rho = spearman(x, y, samples=200).rho
-            label = method if np.isnan(rho) else f"{method}: ρ = {rho:.2f}"
+            rhos += [] if np.isnan(rho) else [f"{method} {rho:.2f}"]
             colour, _ = style.method_style(method, k)
-            ax.scatter(
-                x, y, s=16, marker=_MARKS[k % len(_MARKS)], color=colour, alpha=0.75, lw=0, label=label
-            )
-        ax.set(xlabel="initial contact error [mm]", ylabel=title, xlim=(0, None), ylim=(0, None))
-        ax.set_title(f"ρ in the paper: {published.SPEARMAN[name]:.2f}")
-        ax.legend(loc="best")
+            mark = _MARKS[k % len(_MARKS)]
+            ax.scatter(x, y, s=16, marker=mark, color=colour, alpha=0.75, lw=0, label=method)
+        ax.set(xlabel="initial contact error [mm]", ylabel=title)
+        _logarithmic(ax, "x", "y")
+        ax.set_title(
+            "\n".join(["Spearman's ρ:", *_in_lines(rhos), f"published {published.SPEARMAN[name]:.2f}"])
+        )
+    handles, labels = panels[0].get_legend_handles_labels()
+    if handles:
+        figure.legend(handles, labels, loc="outside lower center", ncols=6)
     return figure
+
+
+def _in_lines(words: Sequence[str], width: int = 3) -> list[str]:
+    return [", ".join(words[k : k + width]) for k in range(0, len(words), width)]
+
+
+def _logarithmic(ax: Axes, *axes: str) -> None:
+    """Logarithmic axes with plain numbers at 1, 2 and 5 of each decade, or at 1 alone over many."""
+    from matplotlib.ticker import LogLocator, NullFormatter
+
+    for name in axes:
+        axis = ax.xaxis if name == "x" else ax.yaxis
+        ax.set(**{f"{name}scale": "log"})
+        low, high = ax.get_xlim() if name == "x" else ax.get_ylim()
+        axis.set_major_locator(LogLocator(subs=(1, 2, 5) if high < 200 * low else (1, 3)))
+        axis.set_major_formatter("{x:g}")
+        axis.set_minor_formatter(NullFormatter())
 
 
 def shape_by_set(records: Sequence[TrialRecord]) -> Figure:
@@ -83,11 +107,8 @@ def shape_by_set(records: Sequence[TrialRecord]) -> Figure:
     ax.axhspan(low, high, color="#DDDDDD", zorder=0, lw=0, label=f"set means in the paper: {low} – {high} mm")
     labels = [f"{name}: {VARIED[name]}\n({len(CONDITION_SETS[name])} conditions)" for name in CONDITION_SETS]
     ax.set_xticks(range(len(labels)), labels)
-    ax.set(
-        ylabel="shape RMSE [mm]",
-        ylim=(0, None),
-        title="Shape error by condition set",
-    )
+    ax.set(ylabel="shape RMSE [mm]")
+    _logarithmic(ax, "y")
     ax.grid(visible=False, axis="x")
     figure.legend(loc="outside lower center", ncols=4)
     return figure
@@ -116,7 +137,7 @@ def overlays(traces: Iterable[tuple[Condition, TrialTraces]], method: str) -> Fi
         lowest.set_xlabel("x [mm]")
         lowest.tick_params(labelbottom=True)
     figure.suptitle(
-        f"{method} (colour) over the true tip (black), top view from the start, y stretched", fontsize=9
+        f"{method} (colour) over the true tip (grey), top view from the start, y stretched", fontsize=9
     )
     return figure
 
@@ -129,24 +150,30 @@ def against_baselines(
     rivals = [m for m in present if m != method and (m in BASELINES or m == "paper")]
     if not rivals:
         return None
-    figure = style.new_figure(min(9.0, 0.6 + 2.6 * len(rivals)), 3.1)
-    for ax, rival in zip(figure.subplots(1, len(rivals), squeeze=False)[0], rivals, strict=True):
+    columns = min(3, len(rivals))
+    rows = -(-len(rivals) // columns)
+    figure = style.new_figure(2.4 * columns, 2.6 * rows)
+    panels = figure.subplots(rows, columns, squeeze=False).ravel()
+    for ax, rival in zip(panels, rivals, strict=False):
         ours, theirs = aligned(records, (method, rival), metric)
-        both = np.isfinite(ours) & np.isfinite(theirs)
+        both = np.isfinite(ours) & np.isfinite(theirs) & (ours > 0) & (theirs > 0)
         ours, theirs = ours[both], theirs[both]
-        top = 1.05 * float(max(ours.max(initial=0.1), theirs.max(initial=0.1)))
-        ax.plot([0, top], [0, top], color=style.GREY, lw=1)
+        pooled = np.concatenate([ours, theirs]) if len(ours) else np.array([0.1, 1.0])
+        limits = (0.8 * float(pooled.min()), 1.25 * float(pooled.max()))
+        ax.plot(limits, limits, color=style.GREY, lw=1)
         ax.scatter(theirs, ours, s=14, color=style.method_style(method)[0], alpha=0.7, lw=0)
-        ax.set(xlim=(0, top), ylim=(0, top), xlabel=f"{rival} [mm]", ylabel=f"{method} [mm]", aspect="equal")
+        ax.set(xlim=limits, ylim=limits, xlabel=f"{rival} [mm]", ylabel=f"{method} [mm]", aspect="equal")
+        _logarithmic(ax, "x", "y")
+        ax.set(xlim=limits, ylim=limits)
         ax.set_title(f"better in {int(np.sum(ours < theirs))} of {len(ours)}")
+    for ax in panels[len(rivals) :]:
+        ax.set_axis_off()
     return figure
 
 
 def error_distribution(records: Sequence[TrialRecord], metric: str = "trajectory_rmse_mm") -> Figure:
     """Part of the trials within an error, for each method."""
-    from matplotlib.ticker import LogLocator, NullFormatter
-
-    figure = style.new_figure(7.2, 2.8)
+    figure = style.new_figure(7.2, 3.2)
     ax = figure.subplots()
     for k, method in enumerate(methods_of(records)):
         values = np.array(list(values_by_trial(records, method, metric).values()))
@@ -163,12 +190,8 @@ def error_distribution(records: Sequence[TrialRecord], metric: str = "trajectory
             label=f"{method} ({len(values)} of {trials})",
         )
     ax.set(xlabel="trajectory RMSE [mm]", ylabel="part of the trials", ylim=(0, 1.02))
-    ax.set_xscale("log")
-    ax.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    ax.xaxis.set_major_formatter("{x:g}")
-    ax.xaxis.set_minor_formatter(NullFormatter())
-    ax.set_title("Trials within an error; those that gave no result never come within it")
-    ax.legend(loc="lower right")
+    _logarithmic(ax, "x")
+    figure.legend(loc="outside lower center", ncols=3)
     return figure
 
 
@@ -203,13 +226,13 @@ def _sets_with(found: Mapping[Condition, object]) -> dict[str, list[Condition]]:
 
 
 def _overlay(ax: Axes, traces: Sequence[TrialTraces], method: str, colour: str) -> None:
+    truth = _finite_truth(traces)
+    if truth is not None:
+        ax.plot(truth[:, 0], truth[:, 1], color=style.TRUTH, lw=2.2, alpha=0.3)
     for trace in traces:
         p = trace.methods_mm.get(method)
         if p is not None:
-            ax.plot(p[:, 0], p[:, 1], color=colour, lw=0.7, alpha=0.7)
-    truth = _finite_truth(traces)
-    if truth is not None:
-        ax.plot(truth[:, 0], truth[:, 1], color=style.TRUTH, lw=1.4)
+            ax.plot(p[:, 0], p[:, 1], color=colour, lw=0.7, alpha=0.8)
 
 
 def _finite_truth(traces: Sequence[TrialTraces]) -> FloatArray | None:

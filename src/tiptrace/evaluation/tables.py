@@ -49,6 +49,11 @@ class Table:
         """Rows as a reader sees them."""
         return [[show(v, c.digits) for v, c in zip(row, self.columns, strict=True)] for row in self.rows]
 
+    def is_text(self, column: int) -> bool:
+        """Whether a column holds words, which stand to the left; numbers, with their doubt too, to the right."""
+        cells = [row[column] for row in self.rows]
+        return any(isinstance(c, str) and c[:1].isalpha() for c in cells)
+
     def csv(self) -> str:
         """CSV with machine names and full precision; unknown values are empty."""
         buffer = io.StringIO()
@@ -68,14 +73,15 @@ class Table:
             f"**{self.title}**",
             "",
             "| " + " | ".join(_escape_markdown(c.heading) for c in self.columns) + " |",
-            "|" + "|".join([" :--- ", *[" ---: "] * (len(self.columns) - 1)]) + "|",
+            "|" + "|".join(" :--- " if self.is_text(k) else " ---: " for k in range(len(self.columns))) + "|",
             *("| " + " | ".join(row) + " |" for row in rows),
         ]
         return "\n".join([*lines, *(["", self.note] if self.note else []), ""])
 
     def latex(self) -> str:
-        r"""A ``table`` environment for ``booktabs``."""
+        r"""A ``table`` environment for ``booktabs`` and ``graphicx``; too wide a table is made to fit."""
         rows = [" & ".join(_escape_latex(cell) for cell in row) + r" \\" for row in self.text_rows()]
+        kinds = "".join("l" if self.is_text(k) else "r" for k in range(len(self.columns)))
         head = " & ".join(rf"\textbf{{{_escape_latex(c.heading)}}}" for c in self.columns) + r" \\"
         return "\n".join(
             [
@@ -83,13 +89,14 @@ class Table:
                 r"  \centering",
                 rf"  \caption{{{_escape_latex(self.title)}}}",
                 rf"  \label{{tab:{self.name.replace('_', '-')}}}",
-                rf"  \begin{{tabular}}{{l{'r' * (len(self.columns) - 1)}}}",
+                r"  \resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%",
+                rf"  \begin{{tabular}}{{{kinds}}}",
                 r"    \toprule",
                 f"    {head}",
                 r"    \midrule",
                 *(f"    {row}" for row in rows),
                 r"    \bottomrule",
-                r"  \end{tabular}",
+                r"  \end{tabular}}",
                 *([f"  % {self.note}"] if self.note else []),
                 r"\end{table}",
                 "",

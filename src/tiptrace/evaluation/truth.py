@@ -64,6 +64,20 @@ class Truth:
         p[inside] = between
         return p
 
+    def nearest(self, stamp_ns: int) -> tuple[FloatArray, float]:
+        """True position at an instant for which there must be one: (3,) m, and s to the sample that stands in.
+
+        An estimate belongs to the exposure, which may lie a latency before the first sample of the truth; up to
+        ``max_gap_s`` outside the recorded span the first or last sample stands in. NaN farther out and in gaps.
+        """
+        p = self.at([stamp_ns])[0]
+        if len(self) == 0 or np.isfinite(p).all():
+            return p, 0.0
+        end = 0 if stamp_ns < self.stamps_ns[0] else -1
+        away_s = abs(int(self.stamps_ns[end]) - stamp_ns) * 1e-9
+        outside = stamp_ns < self.stamps_ns[0] or stamp_ns > self.stamps_ns[-1]
+        return (self.p_B[end], away_s) if outside and away_s <= self.max_gap_s else (p, 0.0)
+
     def between(self, start_ns: int, end_ns: int) -> tuple[StampArray, FloatArray]:
         """Samples of an interval, both ends interpolated where possible: (k,) ns and (k, 3) m."""
         inside = (self.stamps_ns > start_ns) & (self.stamps_ns < end_ns)
