@@ -11,6 +11,7 @@ from rich.markup import escape
 import tiptrace
 from tiptrace.cli.calibrate_check import calibrate_check
 from tiptrace.cli.calibrate_gel import calibrate_gel
+from tiptrace.cli.calibrate_rig import calibrate_rig
 from tiptrace.cli.calibrate_tip import calibrate_tip
 from tiptrace.cli.compare import compare
 from tiptrace.cli.demo import demo
@@ -50,6 +51,7 @@ app.command("import-gel")(import_gel)
 calibrate.command("gel")(calibrate_gel)
 calibrate.command("check")(calibrate_check)
 calibrate.command("tip")(calibrate_tip)
+calibrate.command("rig")(calibrate_rig)
 
 
 def _version(show: bool) -> None:
