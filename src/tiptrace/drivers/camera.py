@@ -163,6 +163,8 @@ class ThreadedCamera(Closing):
                     self._reconnect(error)
         except DeviceError as error:
             self._error = error
+        except Exception as error:  # noqa: BLE001  a thread that dies must not do so silently
+            self._error = DeviceError(f"{self.name}: {error}")
         finally:
             self._first.set()
             self._source.disconnect()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import importlib
 import socket
+import struct
 import threading
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
@@ -21,9 +22,10 @@ from tiptrace.types import OpeningSample, PoseSample
 _PORT = 30004
 _REACH_S = 1.5
 _FIRST_POSE_S = 5.0
-_POLL_S = 0.001
+_POLL_S = 0.002
 _SILENCE_S = 0.5
 _BACK_OFF_S = (0.1, 1.0)
+_REGISTERS = (*range(12, 20), *range(36, 44))  # that the client can read
 
 
 class UrRobot(Closing):
@@ -94,6 +96,12 @@ class UrRobot(Closing):
     # --- the thread ----------------------------------------------------------------------------------------
 
     def _run(self, receiver: Any) -> None:
+        try:
+            self._follow(receiver)
+        except Exception as error:  # noqa: BLE001  a thread that dies must not do so silently
+            self._queue.fail(DeviceError(f"{self.name}: {error}"))
+
+    def _follow(self, receiver: Any) -> None:
         while not self._stop.is_set():
             reason = self._receive(receiver)
             if self._stop.is_set():
@@ -145,7 +153,7 @@ class UrRobot(Closing):
         """
         remedy = "check the address, that the arm is on, and that the network cable is plugged in"
         try:
-            socket.create_connection((self._host, _PORT), timeout=_REACH_S).close()
+            _shake_hands(self._host)
         except OSError as error:
             why = getattr(error, "strerror", None) or str(error)
             raise DeviceError(
@@ -175,6 +183,19 @@ class UrRobot(Closing):
         return None
 
 
+def _shake_hands(host: str) -> None:
+    """Make sure that an RTDE server answers: the client holds the interpreter while it connects, without a limit.
+
+    Raises:
+        OSError: unreachable, or silent.
+    """
+    request = struct.pack(">HBH", 5, ord("V"), 2)  # protocol version 2
+    with socket.create_connection((host, _PORT), timeout=_REACH_S) as connection:
+        connection.sendall(request)
+        if not connection.recv(16):
+            raise ConnectionError("the connection was closed at once")
+
+
 def _register(uri: str, query: str) -> int | None:
     values = parse_qs(query)
     unknown = set(values) - {"opening_register"}
@@ -186,8 +207,10 @@ def _register(uri: str, query: str) -> int | None:
         register = int(values["opening_register"][0])
     except ValueError:
         register = -1
-    if not 0 <= register <= 47:
-        raise ConfigError(f"{uri}: opening_register is the number of an output double register, 0 to 47")
+    if register not in _REGISTERS:
+        raise ConfigError(
+            f"{uri}: opening_register is the number of an output double register, 12 to 19 or 36 to 43"
+        )
     return register
 
 

@@ -24,6 +24,7 @@ from tiptrace.types import (
     SIDES,
     Anchor,
     Event,
+    FingerObservation,
     FingerView,
     FloatArray,
     ImageSample,
@@ -159,9 +160,11 @@ class LiveSession:
         with ExitStack() as stack:
             if not opened:
                 stack.enter_context(self.stream)
+            _rehearse(self.stream, self.method)
             if self.recorder is not None:
                 stack.enter_context(self.recorder)
             tracer = stack.enter_context(open_tracer(self.stream, self.method))
+            self.stream.discard()
             self.tracer, monitor = tracer, StageOneMonitor(tracer)
             if self.on_open is not None:
                 self.on_open()
@@ -262,6 +265,22 @@ class LiveSession:
                     f"the disk does not keep up: {state.dropped} samples are missing in the recording"
                 )
         return tuple(notes)
+
+
+def _rehearse(stream: LiveStream, method: str) -> None:
+    """Sense the first images once and forget it: what is slow the first time is over when the trial begins.
+
+    Raises:
+        PerceptionError: the images or references cannot be used.
+    """
+    if len(stream.first_images) < 2:
+        return
+    left, right = (
+        FingerObservation(ImageSample(side, 0, stream.first_images[side]), np.eye(4)) for side in SIDES
+    )
+    with open_tracer(stream, method) as tracer:
+        for _ in range(2):
+            tracer.sensing(Observation(0, left, right))
 
 
 class _Views:

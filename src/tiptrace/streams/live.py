@@ -123,6 +123,11 @@ class LiveStream:
         known = [rate for rate in rates if rate is not None]
         if len(known) == 2:
             self.settings = replace(LIVE, min_frame_spacing_s=_SPACING_SHARE / max(known))
+
+    def discard(self) -> None:
+        """Forget what has come so far: the loop begins with what comes from now on."""
+        for side in SIDES:
+            self._cameras[side].take()
         self._robot.take()
 
     # --- control, from any thread --------------------------------------------------------------------------
@@ -164,9 +169,8 @@ class LiveStream:
                 self._wake.clear()
             samples = self._gather()
             if not self.standby:
-                for sample, jpeg in samples:
-                    if self.tap is not None:
-                        self.tap(sample, self._log_time_ns(sample), jpeg)
+                self._tap(samples)
+                for sample, _ in samples:
                     yield sample
             if stopping:
                 return
@@ -203,11 +207,17 @@ class LiveStream:
             self._arrived.popitem(last=False)
         return found
 
-    def _log_time_ns(self, sample: Sample) -> int:
-        """What has no header is dated by it; so live and recorded marks are the same."""
-        if isinstance(sample, PhaseSample | OpeningSample):
-            return sample.stamp_ns
-        return self.timeline.now_ns()
+    def _tap(self, samples: list[tuple[Sample, bytes | None]]) -> None:
+        """Show them to the tap at once, however long the loop takes over them.
+
+        What has no header is dated by its log time; so live and recorded marks are the same.
+        """
+        if self.tap is None:
+            return
+        now_ns = self.timeline.now_ns()
+        for sample, jpeg in samples:
+            undated = isinstance(sample, PhaseSample | OpeningSample)
+            self.tap(sample, sample.stamp_ns if undated else now_ns, jpeg)
 
     def _ended(self) -> bool:
         return any(health.status is DeviceStatus.ENDED for health in self.health().values())
