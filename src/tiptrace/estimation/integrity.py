@@ -16,7 +16,8 @@ from tiptrace.estimation.motion import Motions
 from tiptrace.types import BoolArray, FloatArray
 
 _BEFORE, _AFTER = 10, 4  # frames compared for a slip
-_STILL = 10  # frames over which a tool in the air hangs still
+_STILL, _STILL_SLOW = 4, 10  # frames over which a tool in the air hangs still, with and without a Stage I
+_DEPTH_SHARE = 0.3  # of a swing along the closing axis, which depends on depth and is noisier
 
 
 class IntegrityConfig(BaseModel):
@@ -40,6 +41,8 @@ class IntegrityConfig(BaseModel):
     release_m: float = Field(default=4.5e-4, gt=0)
     still_axial_m: float = Field(default=1.0e-4, gt=0)
     still_across_m: float = Field(default=1.5e-4, gt=0)
+    unloaded_m: float = Field(default=1.5e-3, gt=0)  # across its axis, of where it hung before the hand moved
+    unloaded_again_m: float = Field(default=1.0e-3, gt=0)  # of where it hung in the air before
     regain_m: float = Field(default=2e-4, gt=0)
     pose_gap_s: float = Field(default=0.1, gt=0)
 
@@ -51,27 +54,44 @@ class Reference:
     Attributes:
         chi2: Median χ² of the rigid fit.
         axis_E: (3,) from the pads to the tip.
+        normal_E: (3,) closing axis.
         axial_m: (2,) 5th and 95th percentile of the tool's displacement along it.
+        start_E: (3,) displacement D before the hand moved: nothing pulls the tip aside then. None without a Stage I.
         twist_rad: Median twist of the left pad's markers against the right's.
         twist_spread_rad: Its spread (1.48 × median absolute deviation).
     """
 
     chi2: float
     axis_E: FloatArray
+    normal_E: FloatArray
     axial_m: tuple[float, float]
+    start_E: FloatArray | None
     twist_rad: float
     twist_spread_rad: float
 
 
-def reference(motions: Motions, c_E: FloatArray, twists: FloatArray) -> Reference:
-    """From the motions of Stage I, the tip in F_E, and the pads' twists (T,)."""
+def reference(
+    motions: Motions, c_E: FloatArray, normal_E: FloatArray, twists: FloatArray, staged: bool = True
+) -> Reference:
+    """From the motions of Stage I, the tip in F_E, and the pads' twists (T,).
+
+    Args:
+        motions: T frames.
+        c_E: (3,) tip in F_E.
+        normal_E: (3,) closing axis in F_E.
+        twists: (T,) of the left pad's markers against the right's, rad.
+        staged: Whether the frames are a Stage I, which starts with the hand at rest.
+    """
     axis = c_E - motions.centre.mean(axis=0)
     axis = axis / np.linalg.norm(axis)
     D = motions.R @ c_E + motions.t - c_E  # (T, 3)
     low, high = np.percentile(D @ axis, [5, 95])
     middle = float(np.median(twists))
     spread = 1.48 * float(np.median(np.abs(twists - middle)))
-    return Reference(float(np.median(motions.chi2)), axis, (float(low), float(high)), middle, spread)
+    start = np.median(D[:5], axis=0) if staged else None
+    return Reference(
+        float(np.median(motions.chi2)), axis, normal_E, (float(low), float(high)), start, middle, spread
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,9 +126,11 @@ class Monitor:
         self._last_residual: FloatArray | None = None
         self._same = np.zeros(2, dtype=int)
         self._recent: deque[tuple[float, FloatArray]] = deque(maxlen=_BEFORE + _AFTER)  # χ², D
-        self._path: deque[FloatArray] = deque(maxlen=_STILL)
+        self._path: deque[FloatArray] = deque(maxlen=_STILL_SLOW)
         self._twisted = 0
-        self._contact, self._free_m = True, 0.0
+        self._contact = True
+        self._free_m: float | None = None
+        self._free_E: FloatArray | None = None
 
     def repeated(self, x_S: FloatArray, pad: FloatArray) -> tuple[bool, bool]:
         """Whether each finger's frame equals the last one; call once per frame, first."""
@@ -182,29 +204,40 @@ class Monitor:
         return bool(alone or with_jump)
 
     def _judge_contact(self, D: FloatArray, ref: Reference) -> None:
-        """In the air the tool has sprung out along its axis and hangs still in the grasp while the hand moves on.
+        """In the air the tool has sprung out along its axis, hangs still, and nothing pulls it aside any more.
 
-        Either alone is not enough: friction on a tilted tool pulls it out as well, and on a straight path it is
-        still. Judged over ten frames; shorter losses are not told.
+        None of the three alone is enough: friction on a tilted tool pulls it out as well, and on a straight path it
+        is still. Gels that carry no load look alike before and after a slip, so that the place where the tool hung
+        before the hand moved stays good. Without a Stage I that place is not known, and stillness has to last longer.
         """
-        self._path.append(D)
-        axial = float(D @ ref.axis_E)
         c = self._config
-        if len(self._path) < _STILL:
+        self._path.append(D)
+        frames = _STILL_SLOW if ref.start_E is None else _STILL
+        if len(self._path) < frames:
             return
-        path = np.stack(self._path)
-        along = path @ ref.axis_E  # (10,)
+        path = np.stack(self._path)[-frames:]
+        along = path @ ref.axis_E  # (frames,)
         across = path - np.outer(along, ref.axis_E)
-        thirds = np.stack([across[:3].mean(axis=0), across[3:7].mean(axis=0), across[7:].mean(axis=0)])
-        swing = float(np.linalg.norm(thirds - thirds.mean(axis=0), axis=1).max())
+        half = across[-frames // 2 :].mean(axis=0) - across[: frames // 2].mean(axis=0)
+        half -= (1.0 - _DEPTH_SHARE) * (half @ ref.normal_E) * ref.normal_E
+        swing = float(np.linalg.norm(half))
         if not self._contact:  # what moves against the hand is held by something
-            self._contact = abs(axial - self._free_m) > c.regain_m or swing > 2.0 * c.still_across_m
+            back = self._free_m is not None and abs(float(along[-1]) - self._free_m) > c.regain_m
+            self._contact = back or swing > 2.0 * c.still_across_m
             if self._contact:
                 self._path.clear()
             return
-        out = float(np.median(along)) > ref.axial_m[1] + c.release_m
-        if out and np.ptp(along) < c.still_axial_m and swing < c.still_across_m:
-            self._contact, self._free_m = False, float(np.median(along))
+        middle = np.median(path, axis=0)
+        out = float(along.min() if frames == _STILL else np.median(along)) > ref.axial_m[1] + c.release_m
+        hanging = _unloaded(middle, ref, c.unloaded_m) if out else self._as_before(middle)
+        if hanging and np.ptp(along) < c.still_axial_m and swing < c.still_across_m:
+            self._contact, self._free_m, self._free_E = False, float(np.median(along)), middle
+
+    def _as_before(self, D: FloatArray) -> bool:
+        """Whether the tool hangs where it hung in the air once before."""
+        if self._free_E is None:
+            return False
+        return bool(np.linalg.norm(D - self._free_E) < self._config.unloaded_again_m)
 
     def _jumped(self, residual_E: FloatArray) -> BoolArray:
         last, self._last_residual = self._last_residual, residual_E
@@ -212,3 +245,11 @@ class Monitor:
             return np.zeros(len(residual_E), dtype=bool)
         step = np.linalg.norm(residual_E - last, axis=1)
         return np.asarray(np.where(np.isfinite(step), step, 0.0) > self._config.jump_m)
+
+
+def _unloaded(D: FloatArray, ref: Reference, limit_m: float) -> bool:
+    """Whether the tool, displaced by D (3,), is out along its axis and across it where it hung at the start."""
+    if ref.start_E is None:
+        return float(D @ ref.axis_E) > ref.axial_m[1]
+    away = D - ref.start_E
+    return bool(np.linalg.norm(away - (away @ ref.axis_E) * ref.axis_E) < limit_m)

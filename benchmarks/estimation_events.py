@@ -1,0 +1,197 @@
+"""How surely events are told: slips of the tool, losses of contact, false alarms, and re-anchoring.
+
+    python benchmarks/estimation_events.py --seeds 1000:1024 --cache build/trials
+
+Marker-level trials of the virtual rig at level ``nominal``. A true slip is 1.5° or 0.5 mm of the tool against the pads
+within half a second; a true loss of contact lasts longer than 0.2 s. A slip counts as found when it is told within 1 s
+of its end, a loss when it is told within 0.3 s of its end, by an event that reaches into it. Every other
+slip or loss that is told is a false one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import pickle
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from estimation_trials import Trial, simulate
+
+from tiptrace.errors import SimulationError
+from tiptrace.estimation.full import FullConfig, FullEstimator
+from tiptrace.sim.conditions import CONDITIONS
+from tiptrace.sim.spec import FrictionDrop, Lift, Push, TrialSpec
+from tiptrace.types import Event, TipEstimate
+
+SLIP_DEG, SLIP_M, SLIP_WINDOW_S = 1.5, 0.5e-3, 0.5
+LOSS_S, TOLD_LOSS_S, TOLD_SLIP_S = 0.2, 0.3, 1.0
+_FPS = 25.0
+
+
+@dataclass
+class Score:
+    """Counts over trials."""
+
+    true: int = 0
+    found: int = 0
+    false: Counter[str] = field(default_factory=Counter)
+    minutes: float = 0.0
+    delays_s: list[float] = field(default_factory=list)
+    missed: list[str] = field(default_factory=list)
+
+
+def spec(kind: str, seed: int, level: str) -> TrialSpec:
+    """A trial with three disturbances of one kind at random times, of random size."""
+    rng = np.random.default_rng([seed, len(kind)])
+    c = CONDITIONS[seed % len(CONDITIONS)]
+    starts = 5.0 + 2.2 * np.arange(3) + rng.uniform(0.0, 0.8, 3)
+    extra: dict[str, object] = {}
+    if kind == "lift":
+        extra["lifts"] = tuple(
+            Lift(
+                start_s=float(s),
+                duration_s=float(rng.uniform(0.4, 1.4)),
+                height_m=float(rng.uniform(4e-3, 8e-3)),
+            )
+            for s in starts
+        )
+    if kind == "slip":
+        starts = 5.2 + 2.6 * np.arange(2) + rng.uniform(0.0, 1.0, 2)
+        factors, sides = rng.uniform(0.02, 0.10, 2), rng.choice([-1.0, 1.0], 2) * rng.uniform(1.0, 4.0, 2)
+        extra["friction_drops"] = tuple(
+            FrictionDrop(start_s=float(s), duration_s=0.5, factor=float(f))
+            for s, f in zip(starts, factors, strict=True)
+        )
+        extra["pushes"] = tuple(
+            Push(start_s=float(s), duration_s=0.5, force_n=(0.0, float(f), 0.0))
+            for s, f in zip(starts, sides, strict=True)
+        )
+    return TrialSpec(
+        trajectory=c.trajectory,
+        tool=c.tool,
+        wrist=c.wrist,
+        grasp=c.grasp,
+        level=level,
+        mode="markers",
+        seed=seed,
+        travel_m=0.14 if kind == "lift" else 0.12,
+        **extra,
+    )
+
+
+def trial(kind: str, seed: int, level: str, cache: Path | None) -> Trial:
+    """Simulated, or from the cache."""
+    path = None if cache is None else cache / f"{kind}-{level}-{seed}.pkl"
+    if path is not None and path.exists():
+        return pickle.loads(path.read_bytes())  # our own file
+    result = simulate(spec(kind, seed, level))
+    if path is not None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(pickle.dumps(result))
+    return result
+
+
+def true_losses(t: Trial) -> list[tuple[int, int]]:
+    """Exposure intervals without contact, ns."""
+    free = np.concatenate([[False], ~t.in_contact, [False]])
+    edges = np.flatnonzero(np.diff(free.astype(int)))
+    spans = [(int(t.exposure_ns[a]), int(t.exposure_ns[b - 1])) for a, b in edges.reshape(-1, 2)]
+    return [(a, b) for a, b in spans if (b - a) * 1e-9 + 1.0 / _FPS > LOSS_S]
+
+
+def true_slips(t: Trial) -> list[tuple[int, int]]:
+    """Intervals in which the tool moved in the pads by more than the limit within half a second, ns."""
+    n = round(SLIP_WINDOW_S * _FPS)
+    turn, shift = np.abs(t.slip_deg[n:] - t.slip_deg[:-n]), t.slip_m[n:] - t.slip_m[:-n]
+    much = np.concatenate([[False], (turn > SLIP_DEG) | (shift > SLIP_M), [False]])
+    edges = np.flatnonzero(np.diff(much.astype(int)))
+    return [
+        (int(t.exposure_ns[a]), int(t.exposure_ns[min(b - 1 + n, len(t.exposure_ns) - 1)]))
+        for a, b in edges.reshape(-1, 2)
+    ]
+
+
+def run(t: Trial) -> tuple[list[TipEstimate], list[tuple[Event, int]]]:
+    """Estimates, and the events with the instant (exposure, ns) at which each was first told."""
+    estimator = FullEstimator(FullConfig(use_tip_prior=False), t.rig, t.tool)
+    estimates: list[TipEstimate] = []
+    told: list[int] = []
+    for pair in t.pairs:
+        estimates.append(estimator.update(pair))
+        told += [estimates[-1].stamp_ns] * (len(estimator.events) - len(told))
+    return estimates, list(zip(estimator.events, told, strict=True))
+
+
+def match(
+    score: Score,
+    name: str,
+    spans: list[tuple[int, int]],
+    events: list[tuple[Event, int]],
+    kind: str,
+    within_s: float,
+) -> None:
+    """Which true intervals were told in time; what is left over is false."""
+    slack = round(within_s * 1e9)
+    used: set[int] = set()
+    for a, b in spans:
+        hits = [
+            k
+            for k, (e, told) in enumerate(events)
+            if e.kind == kind and told <= b + slack and e.end_ns >= a - round(5e7) and e.start_ns <= b + slack
+        ]
+        late = [
+            k
+            for k, (e, _) in enumerate(events)
+            if e.kind == kind and e.start_ns <= b + 10**9 and e.end_ns >= a - 10**9
+        ]
+        used.update(hits, late)
+        score.true += 1
+        score.found += bool(hits)
+        if hits:
+            score.delays_s.append((events[hits[0]][1] - a) * 1e-9)
+        else:
+            score.missed.append(
+                f"{name} {(a - int(1.7672256e18)) * 1e-9:.2f}-{(b - int(1.7672256e18)) * 1e-9:.2f}"
+            )
+    score.false.update(e.kind for k, (e, _) in enumerate(events) if k not in used and e.kind == kind)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", default="1000:1012")
+    parser.add_argument("--kinds", default="lift,slip")
+    parser.add_argument("--level", default="nominal")
+    parser.add_argument("--cache", type=Path)
+    parser.add_argument("--cached-only", action="store_true")
+    args = parser.parse_args()
+    for kind in args.kinds.split(","):
+        event, within, truth = (
+            ("contact-lost", TOLD_LOSS_S, true_losses)
+            if kind == "lift"
+            else ("grasp-slip", TOLD_SLIP_S, true_slips)
+        )
+        score = Score()
+        for seed in range(*map(int, args.seeds.split(":"))):
+            if args.cached_only and not (args.cache / f"{kind}-{args.level}-{seed}.pkl").exists():
+                continue
+            try:
+                t = trial(kind, seed, args.level, args.cache)
+            except SimulationError as error:
+                print(f"not simulated: {kind} {seed}: {error}", flush=True)
+                continue
+            _, events = run(t)
+            match(score, f"{t.spec.name} {seed}", truth(t), events, event, within)
+            score.minutes += (t.pairs[-1].stamp_ns - t.pairs[0].stamp_ns) / 6e10
+        delay = f"{np.median(score.delays_s):.2f} s (median after the start)" if score.delays_s else "-"
+        share = 100 * score.found / max(score.true, 1)
+        print(
+            f"{kind}: {score.found} of {score.true} {event} told in time ({share:.1f} %), {delay}; "
+            f"false {dict(score.false)} in {score.minutes:.1f} minutes; missed: {'; '.join(score.missed) or 'none'}",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    main()
