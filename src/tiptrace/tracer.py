@@ -8,17 +8,21 @@ the sensor frames (lines 3 and 5). An ``Estimator`` takes them to the base frame
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from typing import Any, Literal
 
-from tiptrace.config import Rig
+from tiptrace.config import Rig, Tool
 from tiptrace.errors import ConfigError
+from tiptrace.estimation.anchor import TipPrior
 from tiptrace.estimation.baselines import EeOracleEstimator, LocalAnchoringEstimator, NominalTipEstimator
 from tiptrace.estimation.ee_only import EeOnlyEstimator, Estimator
-from tiptrace.estimation.full import FullEstimator
+from tiptrace.estimation.full import FullConfig, FullEstimator
 from tiptrace.estimation.paper import PaperEstimator
+from tiptrace.estimation.stage_one import Anchoring
 from tiptrace.perception.finger import Finger
-from tiptrace.perception.gel_model import load_gel_model
+from tiptrace.perception.gel_model import GelModel, load_gel_model
 from tiptrace.perception.settings import SensingConfig
+from tiptrace.perception.warm_up import warm_up
 from tiptrace.types import (
     SIDES,
     Anchor,
@@ -54,6 +58,9 @@ class Sensing:
         self._config = config or SensingConfig()
         self._both = both
         self.fingers: dict[Side, Finger] = {}
+        self._loaded: dict[str, GelModel] = {}
+        if stream.references:  # images will come: the first one should not wait
+            warm_up()
 
     def __call__(self, observation: Observation) -> SensedPair:
         """Track and lift the markers of a pair.
@@ -78,9 +85,15 @@ class Sensing:
             sensor = self._rig.sensor(side)
             gel = None
             if self._config.depth == "network":
-                gel = load_gel_model(self._gel_models.get(sensor.gel_model, sensor.gel_model))
+                gel = self._gel(sensor.gel_model)
             self.fingers[side] = Finger(sensor, gel, self._references.get(side), self._config, side=side)
         return self.fingers[side]
+
+    def _gel(self, name: str) -> GelModel:
+        """A gel model by the rig's name for it; two gels of one model share it."""
+        if name not in self._loaded:
+            self._loaded[name] = load_gel_model(self._gel_models.get(name, name))
+        return self._loaded[name]
 
 
 class TipTracer:
@@ -105,6 +118,32 @@ class TipTracer:
         return self.estimator.events
 
 
+@dataclass(frozen=True, slots=True)
+class TracerOptions:
+    """What stands in for the usual means: gel network, Stage I, tip.
+
+    Attributes:
+        depth: ``none`` measures in the gels' planes only.
+        tool: In place of the stream's.
+        use_stage_one: Else the tip comes from the tool, from ``anchor_from``, or from nowhere.
+        relative: Without Stage I, tip and ``anchor_from``: displacements from the first contact.
+        anchor_from: Another trial's grasp (same grasp) or tip (regrasp).
+    """
+
+    depth: Literal["network", "none"] = "network"
+    tool: Tool | None = None
+    use_stage_one: bool = True
+    relative: bool = False
+    anchor_from: TipPrior | Anchoring | None = None
+
+    @property
+    def anchored_elsewhere(self) -> bool:
+        """Whether Stage I is not used."""
+        return not self.use_stage_one or self.anchor_from is not None
+
+
+DEFAULT_OPTIONS = TracerOptions()
+
 METHODS: dict[str, str] = {
     "full": "maximum-likelihood anchor, weighted motion, tip map, covariance, integrity",
     "paper": "the paper's method to the letter",
@@ -120,26 +159,35 @@ def sensing_of(method: str) -> Literal["paper", "full"]:
     return "paper" if method == "paper" else "full"
 
 
-def make_estimator(method: str, stream: Stream, truth_at: TruthAt | None = None) -> Estimator:
+def make_estimator(
+    method: str, stream: Stream, truth_at: TruthAt | None = None, options: TracerOptions = DEFAULT_OPTIONS
+) -> Estimator:
     """The estimator of a method.
 
     Args:
         method: One of :data:`METHODS`.
         stream: For its rig and tool.
         truth_at: True tip at a stamp, for ``ee-oracle`` only.
+        options: Where the tip comes from.
 
     Raises:
-        ConfigError: an unknown name (the valid ones are listed), or no truth for the oracle.
-        GeometryError: ``nominal-tip`` without a tip in the tool's file.
+        ConfigError: an unknown name (the valid ones are listed), no truth for the oracle, or a method that anchors by
+            its own Stage I and is told not to.
+        GeometryError: ``nominal-tip`` or ``use_stage_one = False`` without a tip in the tool's file.
     """
+    tool = options.tool or stream.tool
+    if method == "nominal-tip":
+        return NominalTipEstimator(tool)
     if method == "full":
-        return FullEstimator(rig=stream.rig, tool=stream.tool)
+        return _full(stream, tool, options)
+    if method in METHODS and options.anchored_elsewhere:
+        raise ConfigError(
+            f"method '{method}' anchors by its own Stage I; --tip and --anchor-from need method full"
+        )
     if method == "paper":
         return PaperEstimator()
     if method == "ee-only":
-        return EeOnlyEstimator(FullEstimator(rig=stream.rig, tool=stream.tool))
-    if method == "nominal-tip":
-        return NominalTipEstimator(stream.tool)
+        return EeOnlyEstimator(_full(stream, tool, options))
     if method == "local-anchoring":
         return LocalAnchoringEstimator()
     if method == "ee-oracle":
@@ -149,7 +197,28 @@ def make_estimator(method: str, stream: Stream, truth_at: TruthAt | None = None)
     raise ConfigError(f"unknown method '{method}'; valid: {', '.join(METHODS)}")
 
 
-def make_tracer(stream: Stream, method: str, both: Map = map, truth_at: TruthAt | None = None) -> TipTracer:
+def _full(stream: Stream, tool: Tool | None, options: TracerOptions) -> FullEstimator:
+    config = FullConfig(use_stage_one=options.use_stage_one, relative=options.relative)
+    return FullEstimator(config, rig=stream.rig, tool=tool, anchor_from=options.anchor_from)
+
+
+def sensing_config(method: str, stream: Stream, options: TracerOptions = DEFAULT_OPTIONS) -> SensingConfig:
+    """Settings of the sensing chain; without depth the indentation follows from the tool's thickness."""
+    config = SensingConfig(method=sensing_of(method), depth=options.depth)
+    tool, gripper = options.tool or stream.tool, stream.rig.gripper
+    if options.depth == "network" or tool is None or tool.thickness_m is None or gripper is None:
+        return config
+    pressed_m = 0.5 * (tool.thickness_m - gripper.opening_m)
+    return config.model_copy(update={"indentation_m": pressed_m}) if 0.0 < pressed_m < 5e-3 else config
+
+
+def make_tracer(
+    stream: Stream,
+    method: str,
+    both: Map = map,
+    truth_at: TruthAt | None = None,
+    options: TracerOptions = DEFAULT_OPTIONS,
+) -> TipTracer:
     """A tracer for a stream: sensing and estimator as a method wants them."""
-    estimator = make_estimator(method, stream, truth_at)
-    return TipTracer(Sensing(stream, SensingConfig(method=sensing_of(method)), both), estimator)
+    estimator = make_estimator(method, stream, truth_at, options)
+    return TipTracer(Sensing(stream, sensing_config(method, stream, options), both), estimator)

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tiptrace.perception.compiled import compiled
 from tiptrace.perception.fill import pull_push
 from tiptrace.types import BoolArray, FloatArray
 
@@ -19,7 +19,8 @@ _FLOOR = 0.15  # of the ink's contrast, below which a pixel counts as gel
 _ROUNDS = 2  # of recentring within a window
 _OFF_CENTRE_PX = 1.5  # a dot this far off the middle of its window gets another one
 
-Windows = NDArray[np.float32]
+Grey = NDArray[np.uint8]
+Float32Map = NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,79 +46,139 @@ class DotMeter:
         self.mask_radius_px = min(0.5 * diameter_px + 2.0, 0.42 * pitch_px)
         self._radius = max(min(0.72 * diameter_px + 1.0, 0.5 * pitch_px), 2.5)  # where ink is looked for
         self._core = max(0.28 * diameter_px, 1.0)
-        self._reach = int(np.ceil(self._radius + 1.0))
-        dv, du = np.mgrid[-self._reach : self._reach + 1, -self._reach : self._reach + 1]
-        self._offsets = np.stack([np.ones(du.size), du.ravel(), dv.ravel()], axis=1).astype(
-            np.float32
-        )  # (k², 3)
 
-    def measure(self, grey: NDArray[np.uint8], uv_px: FloatArray) -> DotMeasurement:
+    def measure(self, grey: Grey, uv_px: FloatArray) -> DotMeasurement:
         """Centroids of the dots nearest to places (n, 2) px, which must be right to about half a dot."""
-        contrast = self._contrast(grey, uv_px)
-        uv, ink, area, at = self._centroids(contrast, uv_px)
-        off = np.flatnonzero(np.abs(uv - at).max(axis=1) > _OFF_CENTRE_PX)
-        if off.size:
-            uv[off], ink[off], area[off], _ = self._centroids(contrast, uv[off])
+        uv = np.array(uv_px, dtype=np.float64)  # (n, 2)
+        ink, area = np.zeros(len(uv)), np.zeros(len(uv))
+        mask = self.mask(uv, (grey.shape[0], grey.shape[1]))
+        gel, weight = _halved_gel(grey, mask)
+        pull_push(gel, weight)
+        _measure_dots(grey, mask, gel[0], uv, ink, area, self._radius, self._core)
         return DotMeasurement(uv_px=uv, ink=ink, area_px=area)
 
     def mask(self, uv_px: FloatArray, shape: tuple[int, int], step: int = 1) -> BoolArray:
         """Pixels of the dots at places (n, 2), with a margin, in a map (H, W) that has every ``step``-th pixel."""
-        radius = self.mask_radius_px / step + 0.5
-        k = int(np.ceil(radius))
-        dv, du = np.mgrid[-k : k + 1, -k : k + 1]
-        disc = du**2 + dv**2 <= radius**2
-        H, W = shape
-        places = (uv_px[np.isfinite(uv_px).all(axis=1)] - (step - 1) / 2) / step
-        at = np.clip(np.round(places), (-k, -k), (W - 1 + k, H - 1 + k)).astype(np.intp) + k
-        padded = np.zeros((H + 2 * k, W + 2 * k), dtype=np.bool_)
-        stamp = (dv[disc] * (W + 2 * k) + du[disc])[None]
-        inside = (at >= k).all(axis=1) & (at[:, 0] < W + k) & (at[:, 1] < H + k)
-        at = np.where(inside[:, None], at, np.clip(at, (k, k), (W - 1 + k, H - 1 + k)))
-        padded.ravel()[(at[:, 1] * (W + 2 * k) + at[:, 0])[:, None] + stamp] = True
-        return padded[k : k + H, k : k + W]
+        mask = np.zeros(shape, dtype=np.bool_)
+        _stamp_discs(mask, np.ascontiguousarray(uv_px), self.mask_radius_px / step + 0.5, step)
+        return mask
 
-    def _contrast(self, grey: NDArray[np.uint8], uv: FloatArray) -> Windows:
-        """1 − I/I_gel, (H, W), with I_gel continued under the dots."""
-        H, W = grey.shape
-        mask = self.mask(uv, (H, W))
-        half = ((W + 1) // 2, (H + 1) // 2)  # the gel is smooth: half resolution is enough
-        seen = (~mask).astype(np.float32)
-        image = grey.astype(np.float32)
-        known = np.asarray(cv2.resize(image * seen, half, interpolation=cv2.INTER_AREA), dtype=np.float32)
-        weight = np.asarray(cv2.resize(seen, half, interpolation=cv2.INTER_AREA), dtype=np.float32)
-        gel = cv2.resize(pull_push(known[..., None], weight), (W, H), interpolation=cv2.INTER_LINEAR)
-        contrast = 1.0 - image / np.maximum(gel, 1.0)
-        contrast[~mask] = 0.0
-        return np.asarray(contrast, dtype=np.float32)
 
-    def _centroids(
-        self, contrast: Windows, uv_px: FloatArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray, NDArray[np.intp]]:
-        """Centroids (n, 2), ink (n,), area (n,), and the middles of the windows used (n, 2)."""
-        H, W = contrast.shape
-        at = np.clip(np.round(uv_px), 0, (W - 1, H - 1)).astype(np.intp)  # (n, 2)
-        windows = self._windows(contrast, at)  # (n, k²)
-        uv = np.array(uv_px, dtype=np.float64)
-        du, dv = self._offsets[:, 1], self._offsets[:, 2]
-        for _ in range(_ROUNDS):
-            c = (uv - at).astype(np.float32)
-            rho = np.sqrt((du[None] - c[:, :1]) ** 2 + (dv[None] - c[:, 1:]) ** 2)
-            core = rho <= self._core
-            ink = np.einsum("nk,nk->n", windows, core.astype(np.float32)) / np.maximum(core.sum(axis=1), 1)
-            share = windows * (1.0 / np.maximum(ink, 0.05) / (1.0 - _FLOOR))[:, None].astype(np.float32)
-            weight = np.clip(share - np.float32(_FLOOR / (1.0 - _FLOOR)), 0.0, 1.0)
-            weight[core] = 1.0  # glints
-            weight *= np.clip(np.float32(self._radius + 0.5) - rho, 0.0, 1.0)
-            moments = (weight @ self._offsets).astype(np.float64)  # (n, 3): area, Σ w du, Σ w dv
-            area = np.maximum(moments[:, 0], 1e-3)
-            uv = at + moments[:, 1:] / area[:, None]
-        return uv, ink.astype(np.float64), area, at
+@compiled
+def _stamp_discs(mask: BoolArray, uv_px: FloatArray, radius: float, step: int) -> None:
+    """Mark discs of a radius in map pixels, centred on the map pixel nearest to each place (n, 2)."""
+    H, W = mask.shape
+    for i in range(len(uv_px)):
+        u, v = (uv_px[i, 0] - (step - 1) / 2) / step, (uv_px[i, 1] - (step - 1) / 2) / step
+        if not (abs(u) < 1e6 and abs(v) < 1e6):
+            continue
+        u0, v0 = round(u), round(v)
+        for y in range(max(v0 - int(radius), 0), min(v0 + int(radius) + 1, H)):
+            half = int(np.sqrt(radius * radius - (y - v0) ** 2))
+            for x in range(max(u0 - half, 0), min(u0 + half + 1, W)):
+                mask[y, x] = True
 
-    def _windows(self, contrast: Windows, at: NDArray[np.intp]) -> Windows:
-        """Contrast around integer places (n, 2), (n, k²); 0 outside the image."""
-        r = self._reach
-        padded = cv2.copyMakeBorder(contrast, r, r, r, r, cv2.BORDER_CONSTANT, value=0.0)
-        width = padded.shape[1]
-        stamp = (self._offsets[:, 2] + r) * width + self._offsets[:, 1] + r
-        index = (at[:, 1] * width + at[:, 0])[:, None] + stamp.astype(np.intp)[None]
-        return np.asarray(padded.ravel()[index], dtype=np.float32)
+
+@compiled
+def _halved_gel(grey: Grey, mask: BoolArray) -> tuple[Float32Map, Float32Map]:
+    """Sums (1, h, w) and weights (h, w) of the pixels that are not masked, over 2 × 2: the gel is smooth."""
+    H, W = grey.shape
+    h, w = (H + 1) // 2, (W + 1) // 2
+    sums, weight = np.empty((1, h, w), dtype=np.float32), np.empty((h, w), dtype=np.float32)
+    for v in range(h):
+        v1 = min(2 * v + 1, H - 1)
+        for u in range(w):
+            u1 = min(2 * u + 1, W - 1)
+            a, b, c, d = not mask[2 * v, 2 * u], not mask[2 * v, u1], not mask[v1, 2 * u], not mask[v1, u1]
+            total = a * grey[2 * v, 2 * u] + b * grey[2 * v, u1] + c * grey[v1, 2 * u] + d * grey[v1, u1]
+            sums[0, v, u] = np.float32(0.25) * np.float32(total)
+            weight[v, u] = np.float32(0.25) * np.float32(a + b + c + d)
+    return sums, weight
+
+
+@compiled
+def _measure_dots(
+    grey: Grey,
+    mask: BoolArray,
+    gel: Float32Map,
+    uv: FloatArray,
+    ink: FloatArray,
+    area: FloatArray,
+    radius: float,
+    core: float,
+) -> None:
+    """Centroid (in place), ink and area of each dot; once more in a fresh window where it lies off the middle."""
+    H, W = grey.shape
+    reach = int(np.ceil(radius + 1.0))
+    window = np.empty((2 * reach + 1, 2 * reach + 1), dtype=np.float32)
+    for i in range(len(uv)):
+        for _ in range(2):
+            if not (abs(uv[i, 0]) < 1e6 and abs(uv[i, 1]) < 1e6):
+                break
+            u0, v0 = min(max(round(uv[i, 0]), 0), W - 1), min(max(round(uv[i, 1]), 0), H - 1)
+            _contrast_window(grey, mask, gel, u0, v0, window)
+            du, dv = uv[i, 0] - u0, uv[i, 1] - v0
+            for _ in range(_ROUNDS):
+                du, dv, ink[i], area[i] = _centroid(window, du, dv, radius, core)
+            uv[i, 0], uv[i, 1] = u0 + du, v0 + dv
+            if max(abs(du), abs(dv)) <= _OFF_CENTRE_PX:
+                break
+
+
+@compiled
+def _contrast_window(
+    grey: Grey, mask: BoolArray, gel: Float32Map, u0: int, v0: int, window: Float32Map
+) -> None:
+    """1 − I/I_gel around a pixel, with the gel's brightness from its map (h, w) of half the size; 0 off the dots."""
+    H, W = grey.shape
+    h, w = gel.shape
+    reach = window.shape[0] // 2
+    for j in range(window.shape[0]):
+        v = v0 - reach + j
+        y = min(max((v - 0.5) / 2.0, 0.0), h - 1.0)
+        y0 = min(int(y), max(h - 2, 0))
+        b = np.float32(y - y0)
+        for i in range(window.shape[1]):
+            u = u0 - reach + i
+            window[j, i] = 0.0
+            if v < 0 or v >= H or u < 0 or u >= W or not mask[v, u]:
+                continue
+            x = min(max((u - 0.5) / 2.0, 0.0), w - 1.0)
+            x0 = min(int(x), max(w - 2, 0))
+            a = np.float32(x - x0)
+            top = gel[y0, x0] + a * (gel[y0, x0 + 1] - gel[y0, x0])
+            bottom = gel[y0 + 1, x0] + a * (gel[y0 + 1, x0 + 1] - gel[y0 + 1, x0])
+            window[j, i] = np.float32(1.0) - np.float32(grey[v, u]) / max(
+                top + b * (bottom - top), np.float32(1.0)
+            )
+
+
+@compiled
+def _centroid(
+    window: Float32Map, du: float, dv: float, radius: float, core: float
+) -> tuple[float, float, float, float]:
+    """Centroid (du, dv), ink and area in a window of contrasts, starting from (du, dv) off its middle."""
+    reach = window.shape[0] // 2
+    dark, count = 0.0, 0
+    for j in range(window.shape[0]):
+        for i in range(window.shape[1]):
+            if (i - reach - du) ** 2 + (j - reach - dv) ** 2 <= core * core:
+                dark += window[j, i]
+                count += 1
+    ink = dark / max(count, 1)
+    gain = np.float32(1.0 / max(ink, 0.05) / (1.0 - _FLOOR))
+    total, total_u, total_v = 0.0, 0.0, 0.0
+    for j in range(window.shape[0]):
+        for i in range(window.shape[1]):
+            rho = np.sqrt(np.float32((i - reach - du) ** 2 + (j - reach - dv) ** 2))
+            share = min(
+                max(gain * window[j, i] - np.float32(_FLOOR / (1.0 - _FLOOR)), np.float32(0)), np.float32(1)
+            )
+            if rho <= core:
+                share = np.float32(1)  # glints
+            weight = share * min(max(np.float32(radius + 0.5) - rho, np.float32(0)), np.float32(1))
+            total += weight
+            total_u += weight * (i - reach)
+            total_v += weight * (j - reach)
+    area = max(total, 1e-3)
+    return total_u / area, total_v / area, ink, area

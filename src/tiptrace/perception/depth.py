@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tiptrace.perception.background import untouched_background
+from tiptrace.perception.compiled import compiled
 from tiptrace.perception.fill import nearest_fill
 from tiptrace.perception.gel_model import GelModel
 from tiptrace.perception.markers import check_image
@@ -23,6 +24,7 @@ _RIM_PX = (
 _FLAT = 0.03  # change of slope below which gel counts as flat, m/m
 _SHALLOW = 0.25  # of the depth range: flat gel above this level is touched
 _SHALLOW_M = 60e-6  # … but never closer to the lowest gel than its noise
+_THIN = 4  # every so many pixels tell about the depth range
 _VISIBLE = 0.01  # of the image that must be untouched for its median to be the zero level
 
 
@@ -124,11 +126,32 @@ def untouched_gel(h: Float32Map, slope_change: Float32Map) -> tuple[BoolArray, b
     Returns:
         (H, W) mask, and whether it is large enough to define the zero level.
     """
-    smooth = cv2.GaussianBlur(slope_change, (0, 0), max(h.shape[1] / 160.0, 1.0))
-    flat = np.hypot(smooth[..., 0], smooth[..., 1]) < _FLAT
-    lowest, deepest = np.percentile(h[::2, ::2], (5, 99))
-    untouched = flat & (h < lowest + max(_SHALLOW * (deepest - lowest), _SHALLOW_M))
-    return np.asarray(untouched, dtype=np.bool_), bool(untouched.mean() >= _VISIBLE)
+    return untouched_of(h, np.ascontiguousarray(np.moveaxis(slope_change, -1, 0)))
+
+
+def untouched_of(h: Float32Map, slope_change: Float32Map) -> tuple[BoolArray, bool]:
+    """The same with the slopes as two maps, (2, H, W)."""
+    sigma = max(h.shape[1] / 160.0, 1.0)
+    p, q = (np.asarray(cv2.GaussianBlur(s, (0, 0), sigma), dtype=np.float32) for s in slope_change)
+    untouched, share = _flat_and_low(np.ascontiguousarray(h, dtype=np.float32), p, q)
+    return untouched, share >= _VISIBLE
+
+
+@compiled
+def _flat_and_low(h: Float32Map, p: Float32Map, q: Float32Map) -> tuple[BoolArray, float]:
+    """Mask (H, W) of gel that is flat and among the least deep, and its share of the image."""
+    H, W = h.shape
+    sample = np.sort(np.ascontiguousarray(h[::_THIN, ::_THIN]).ravel())
+    last = len(sample) - 1
+    lowest, deepest = sample[round(0.05 * last)], sample[round(0.99 * last)]
+    shallow = lowest + max(_SHALLOW * (deepest - lowest), _SHALLOW_M)
+    untouched = np.empty((H, W), dtype=np.bool_)
+    count = 0
+    for v in range(H):
+        for u in range(W):
+            untouched[v, u] = h[v, u] < shallow and p[v, u] ** 2 + q[v, u] ** 2 < _FLAT**2
+            count += untouched[v, u]
+    return untouched, count / (H * W)
 
 
 def zero_level(h: Float32Map, untouched: BoolArray, visible: bool) -> np.float32:

@@ -7,105 +7,187 @@ it in that direction leaves the dot, weighted by nearness.
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tiptrace.types import FloatArray
+from tiptrace.perception.compiled import compiled
+from tiptrace.types import BoolArray, FloatArray
 
 Float32Map = NDArray[np.float32]
 
 _RING_POINTS = 48
+_LEAST_ENDS = 11  # points that must be seen for a direction to be judged
 _VARIED = 0.04  # standard deviation of the slope around a dot below which the smooth fill is left as it is
 _OUTSIDE_PX = 1.0  # map pixels beyond the dot where values are taken
 
 
 class DotFill:
-    """Fills discs of one radius in maps of one size."""
+    """Fills discs of one radius in maps."""
 
-    def __init__(self, shape: tuple[int, int], radius_px: float) -> None:
-        """For maps of shape (H, W) and discs of a radius in map pixels."""
-        self._shape, self._radius = shape, radius_px
-        half = int(np.ceil(radius_px)) + 1
-        dv, du = np.mgrid[-half : half + 1, -half : half + 1]
-        disc = np.hypot(du, dv) <= radius_px + np.sqrt(0.5)
-        self._offsets = np.stack([du[disc], dv[disc]], axis=1)  # (k, 2)
+    def __init__(self, radius_px: float) -> None:
+        """For discs of a radius in map pixels."""
+        self._radius = radius_px
         angle = 2.0 * np.pi * np.arange(_RING_POINTS) / _RING_POINTS
         self._ring = (radius_px + _OUTSIDE_PX) * np.stack([np.cos(angle), np.sin(angle)], axis=1)  # (m, 2)
 
-    def apply(self, maps: Float32Map, uv: FloatArray) -> None:
-        """Overwrite discs at places (n, 2), map px, in smoothly filled maps (H, W, c)."""
-        if not len(uv):
-            return
-        few, _ = self._around(maps, uv, self._ring[::6])
-        uv = uv[few.std(axis=1).max(axis=1) > _VARIED]
-        if not len(uv):
-            return
-        ring, seen = self._around(maps, uv, self._ring)
-        direction = _from_nearest(self._directions(ring, seen), uv, np.asarray(seen.all(axis=1)))  # (n, 2)
-        at = np.round(uv).astype(np.intp)
-        pixels = at[:, None] + self._offsets[None]  # (n, k, 2)
-        d = pixels - uv[:, None]
-        along = np.einsum("nkc,nc->nk", d, direction)
-        inside2 = self._radius**2 - np.sum(d * d, axis=2)
-        H, W = self._shape
-        keep = (inside2 > 0) & (pixels >= 0).all(axis=2) & (pixels[..., 0] < W) & (pixels[..., 1] < H)
-        dot, k = np.nonzero(keep)
-        reach = np.sqrt(inside2[dot, k] + along[dot, k] ** 2)
-        ahead, behind = reach - along[dot, k] + _OUTSIDE_PX, reach + along[dot, k] + _OUTSIDE_PX
-        place, c = pixels[dot, k].astype(np.float64), direction[dot]
-        front, front_in = self._sample(maps, place + ahead[:, None] * c)
-        back, back_in = self._sample(maps, place - behind[:, None] * c)
-        w = np.where(front_in & back_in, behind / (ahead + behind), np.where(front_in, 1.0, 0.0))
-        w = np.where(front_in | back_in, w, 0.5).astype(np.float32)[:, None]
-        maps[pixels[dot, k, 1], pixels[dot, k, 0]] = w * front + (1.0 - w) * back
-
-    def _directions(self, ring: Float32Map, seen: NDArray[np.bool_]) -> FloatArray:
-        """Unit direction (n, 2) along which mirrored points of the ring agree best.
-
-        Args:
-            ring: (n, m, c) values on the ring.
-            seen: (n, m) which of them lie in the map.
-        """
-        w = seen.astype(np.float32)[..., None]  # (n, m, 1)
-        W, WV = np.fft.rfft(w, axis=1), np.fft.rfft(w * ring, axis=1)
-        WVV = np.fft.rfft(w * np.sum(ring * ring, axis=2, keepdims=True), axis=1)
-        # Σ_k w_k w_k' |v_k − v_k'|² over mirrored points k' = d + m/2 − k: circular convolutions, all d at once
-        squares = np.fft.irfft(
-            2.0 * (W * WVV)[..., 0] - 2.0 * np.sum(WV * WV, axis=2), n=_RING_POINTS, axis=1
-        )
-        count = np.fft.irfft((W * W)[..., 0], n=_RING_POINTS, axis=1)
-        cost = np.where(count > 11.5, squares / np.maximum(count, 1.0), np.inf)
-        cost = np.roll(cost, -_RING_POINTS // 2, axis=1)  # (n, d)
-        best = np.argmin(cost, axis=1)
-        rows = np.arange(len(ring))
-        low, mid, high = (cost[rows, (best + k) % _RING_POINTS] for k in (-1, 0, 1))
-        with np.errstate(invalid="ignore"):
-            curvature = low - 2.0 * mid + high
-            shift = np.where(curvature > 0, 0.5 * (low - high) / np.where(curvature > 0, curvature, 1.0), 0.0)
-        theta = np.pi * (best + np.clip(np.nan_to_num(shift), -0.5, 0.5)) / _RING_POINTS
-        return np.stack([np.cos(theta), np.sin(theta)], axis=1)
-
-    def _around(
-        self, maps: Float32Map, uv: FloatArray, ring: FloatArray
-    ) -> tuple[Float32Map, NDArray[np.bool_]]:
-        """Values (n, m, c) and whether they lie in the map (n, m), on rings (m, 2) around places (n, 2)."""
-        values, seen = self._sample(maps, (uv[:, None] + ring[None]).reshape(-1, 2))
-        return values.reshape(len(uv), len(ring), -1), seen.reshape(len(uv), len(ring))
-
-    def _sample(self, maps: Float32Map, uv: FloatArray) -> tuple[Float32Map, NDArray[np.bool_]]:
-        """Bilinear samples (k, c) at places (k, 2), and whether each lies in the map."""
-        H, W = self._shape
-        at = uv.astype(np.float32)
-        samples = cv2.remap(maps, at[None], np.zeros(0), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        inside = (at >= 0).all(axis=1) & (at[:, 0] <= W - 1) & (at[:, 1] <= H - 1)
-        return np.asarray(samples, dtype=np.float32).reshape(len(uv), -1), np.asarray(inside)
+    def apply(self, planes: Float32Map, uv: FloatArray) -> None:
+        """Overwrite discs at places (n, 2), map px, in smoothly filled maps (c, H, W)."""
+        directions, sure = _directions(planes, uv, self._ring)
+        _borrow_from_nearest(directions, sure, uv)
+        _fill_discs(planes, uv, directions, self._radius)
 
 
-def _from_nearest(direction: FloatArray, uv: FloatArray, sure: NDArray[np.bool_]) -> FloatArray:
-    """Directions (n, 2), those of dots near the border replaced by that of the nearest dot that is seen all round."""
-    if sure.all() or not sure.any():
-        return direction
-    good = np.flatnonzero(sure)
-    nearest = good[np.linalg.norm(uv[:, None] - uv[good][None], axis=2).argmin(axis=1)]
-    return np.where(sure[:, None], direction, direction[nearest])
+@compiled
+def _directions(planes: Float32Map, uv: FloatArray, ring: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Unit direction (n, 2) of least change across each dot, NaN where nothing changes; is it seen all round (n,)?"""
+    n, m, C = len(uv), len(ring), planes.shape[0]
+    directions, sure = np.full((n, 2), np.nan), np.zeros(n, dtype=np.bool_)
+    values, seen = np.empty((C, 3 * m), dtype=np.float32), np.empty(3 * m, dtype=np.float32)
+    cost = np.empty(m)
+    for i in range(n):
+        if not _varies(planes, uv[i, 0], uv[i, 1], ring):
+            continue
+        sure[i] = True
+        for k in range(m):
+            u, v = uv[i, 0] + ring[k, 0], uv[i, 1] + ring[k, 1]
+            inside = _inside(planes, u, v)
+            sure[i] &= inside
+            seen[k::m] = np.float32(inside)
+            for c in range(C):
+                values[c, k::m] = _sample(planes[c], u, v)
+        _disagreement(values, seen, cost)
+        _add_steps_at_touch(values, seen, cost)
+        theta = _lowest(cost)
+        directions[i, 0], directions[i, 1] = np.cos(theta), np.sin(theta)
+    return directions, sure
+
+
+@compiled
+def _varies(planes: Float32Map, u: float, v: float, ring: FloatArray) -> bool:
+    """Whether the standard deviation of any map over some points of the ring is large."""
+    for c in range(planes.shape[0]):
+        total, squares, count = 0.0, 0.0, 0
+        for k in range(0, len(ring), 6):
+            value = float(_sample(planes[c], u + ring[k, 0], v + ring[k, 1]))
+            total += value
+            squares += value * value
+            count += 1
+        if squares / count - (total / count) ** 2 > _VARIED**2:
+            return True
+    return False
+
+
+@compiled
+def _disagreement(values: Float32Map, seen: Float32Map, cost: FloatArray) -> None:
+    """Mean square difference between the ends of the ring's chords at each angle π d/m.
+
+    Values (c, 3 m) and whether they are in the map (3 m,) go round the ring three times. Chords at the angle π d/m end
+    at points k and k' with k + k' = d + m/2; among them are two single points where that is even.
+    """
+    m = len(cost)
+    for d in range(m):
+        odd = (d + m // 2) % 2
+        middle = (d + m // 2) // 2 + m
+        squares, count = np.float32(0.0), np.float32(0.0)
+        for c in range(values.shape[0]):
+            for j in range(1 - odd, m // 2):
+                difference = values[c, middle - j] - values[c, middle + odd + j]
+                squares += seen[middle - j] * seen[middle + odd + j] * difference * difference
+        for j in range(1 - odd, m // 2):
+            count += seen[middle - j] * seen[middle + odd + j]
+        points = 2.0 * count + (1 - odd) * (seen[middle] + seen[middle + m // 2])
+        cost[d] = 2.0 * squares / points if points > _LEAST_ENDS else np.inf
+
+
+@compiled
+def _add_steps_at_touch(values: Float32Map, seen: Float32Map, cost: FloatArray) -> None:
+    """Add the mean square step along the ring where chords at each angle touch it.
+
+    A ridge through the dot's middle looks the same from both sides and from both ends; chords along it touch the ring
+    where the values do not change.
+    """
+    m = len(cost)
+    total, total_cos, total_sin = 0.0, 0.0, 0.0
+    for k in range(m):
+        square = 0.0
+        for c in range(values.shape[0]):
+            square += seen[k] * seen[k + 1] * (values[c, k + 1] - values[c, k]) ** 2
+        angle = 4.0 * np.pi * (k + 0.5) / m
+        total += square
+        total_cos += square * np.cos(angle)
+        total_sin += square * np.sin(angle)
+    for d in range(m):
+        angle = 2.0 * np.pi * d / m
+        cost[d] += 0.5 / m * (total - total_cos * np.cos(angle) - total_sin * np.sin(angle))
+
+
+@compiled
+def _lowest(cost: FloatArray) -> float:
+    """Angle of the least cost (m,), refined by a parabola."""
+    m = len(cost)
+    best = np.argmin(cost)
+    low, mid, high = cost[(best - 1) % m], cost[best], cost[(best + 1) % m]
+    curvature = low - 2.0 * mid + high
+    shift = 0.5 * (low - high) / curvature if 0.0 < curvature < np.inf else 0.0
+    return float(np.pi * (best + min(max(shift, -0.5), 0.5)) / m)
+
+
+@compiled
+def _borrow_from_nearest(directions: FloatArray, sure: BoolArray, uv: FloatArray) -> None:
+    """Give each dot near the border the direction of the nearest one that is seen all round."""
+    for i in range(len(uv)):
+        if sure[i] or np.isnan(directions[i, 0]):
+            continue
+        nearest = np.inf
+        for j in range(len(uv)):
+            distance = (uv[i, 0] - uv[j, 0]) ** 2 + (uv[i, 1] - uv[j, 1]) ** 2
+            if sure[j] and distance < nearest:
+                nearest = distance
+                directions[i] = directions[j]
+
+
+@compiled
+def _fill_discs(planes: Float32Map, uv: FloatArray, directions: FloatArray, radius: float) -> None:
+    """Between the two ends of the chord along a dot's direction, each pixel takes their mean by nearness."""
+    C, H, W = planes.shape
+    half = int(np.ceil(radius)) + 1
+    for i in range(len(uv)):
+        a, b = directions[i]
+        if np.isnan(a):
+            continue
+        u0, v0 = round(uv[i, 0]), round(uv[i, 1])
+        for v in range(max(v0 - half, 0), min(v0 + half + 1, H)):
+            for u in range(max(u0 - half, 0), min(u0 + half + 1, W)):
+                du, dv = u - uv[i, 0], v - uv[i, 1]
+                inside = radius * radius - du * du - dv * dv
+                if inside <= 0.0:
+                    continue
+                along = du * a + dv * b
+                reach = np.sqrt(inside + along * along) + _OUTSIDE_PX
+                ahead, behind = reach - along, reach + along
+                front_seen = _inside(planes, u + ahead * a, v + ahead * b)
+                back_seen = _inside(planes, u - behind * a, v - behind * b)
+                w = np.float32(behind / (ahead + behind) if front_seen == back_seen else front_seen)
+                if not (front_seen or back_seen):
+                    w = np.float32(0.5)
+                for c in range(C):
+                    front = _sample(planes[c], u + ahead * a, v + ahead * b)
+                    back = _sample(planes[c], u - behind * a, v - behind * b)
+                    planes[c, v, u] = w * front + (np.float32(1.0) - w) * back
+
+
+@compiled
+def _inside(planes: Float32Map, u: float, v: float) -> bool:
+    return bool(0.0 <= u <= planes.shape[2] - 1 and 0.0 <= v <= planes.shape[1] - 1)
+
+
+@compiled
+def _sample(plane: Float32Map, u: float, v: float) -> np.float32:
+    """Bilinear, constant beyond the border."""
+    H, W = plane.shape
+    x, y = min(max(u, 0.0), W - 1.0), min(max(v, 0.0), H - 1.0)
+    u0, v0 = min(int(x), W - 2), min(int(y), H - 2)
+    a, b = np.float32(x - u0), np.float32(y - v0)
+    top = plane[v0, u0] + a * (plane[v0, u0 + 1] - plane[v0, u0])
+    bottom = plane[v0 + 1, u0] + a * (plane[v0 + 1, u0 + 1] - plane[v0 + 1, u0])
+    return np.float32(top + b * (bottom - top))

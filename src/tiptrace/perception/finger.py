@@ -21,6 +21,7 @@ from tiptrace.perception.registration import RegisteredTracker
 from tiptrace.perception.seeding import seed
 from tiptrace.perception.settings import SensingConfig
 from tiptrace.perception.tracking import LucasKanadeTracker, MarkerTracker
+from tiptrace.perception.warm_up import warm_up
 from tiptrace.types import BoolArray, FingerMarkers, FloatArray, Image, Side
 
 
@@ -59,6 +60,7 @@ class Finger:
         self._map: DepthMap | None = None
         self._tracker: MarkerTracker | None = None
         self._lifter: Lifter | None = None
+        warm_up()
         with self._named():
             if reference is not None:
                 check_image(reference, sensor.image_size_px)

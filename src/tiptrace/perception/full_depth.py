@@ -9,10 +9,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tiptrace.errors import PerceptionError
 from tiptrace.perception.background import untouched_background
-from tiptrace.perception.depth import DepthMap, untouched_gel
+from tiptrace.perception.compiled import compiled
+from tiptrace.perception.depth import DepthMap, untouched_of
 from tiptrace.perception.dot_fill import DotFill
-from tiptrace.perception.fill import smooth_fill
+from tiptrace.perception.fill import pull_push
 from tiptrace.perception.gel_model import GelModel
 from tiptrace.perception.illumination import LampGain, Level
 from tiptrace.perception.lifting import sample_map
@@ -52,17 +54,18 @@ class FullDepth:
         self.shape = shape = (self._size[1], self._size[0])
         v, u = np.indices(shape, dtype=np.float32) * step + (step - 1) / 2
         self._unit_uv = np.stack([u / W, v / H], axis=-1).reshape(-1, 2)
-        self._background = self._shrink(untouched_background(reference))
-        self._floor = np.maximum(self._background, np.float32(1.0))
+        self._background = np.maximum(self._shrink(untouched_background(reference)), np.float32(1.0))
         scale = (metres_per_px[0] * step, metres_per_px[1] * step)
         self._solver = PoissonSolver(shape, scale)
         self._level = Level(shape, scale)
         self._dot_fill: DotFill | None = None
-        self._lamps = LampGain(shape, self._network)
-        self._flat = self._network(np.ones_like(self._background))  # what the network says of untouched gel
+        self._lamps = LampGain(shape, lambda ratio: self._network(ratio, np.ones(3)))
+        self._flat = self._network(
+            np.ones_like(self._background), np.ones(3)
+        )  # what the network says of untouched gel
         self._calm: BoolArray | None = None
         self._lean_little = np.ones(shape, dtype=np.bool_)
-        self._slopes: Float32Map = np.zeros((*shape, 2), dtype=np.float32)
+        self._slopes: Float32Map = np.zeros((2, *shape), dtype=np.float32)
 
     def __call__(self, image: Image, mask: BoolArray, uv_px: FloatArray) -> DepthMap:
         """Depth of an image, (h, w).
@@ -72,38 +75,43 @@ class FullDepth:
             mask: Map pixels, (h, w) of :attr:`shape`, that the network must not look at.
             uv_px: (n, 2) centres of the dots.
         """
-        ratio = np.asarray(self._shrink(image.astype(np.float32)) / self._floor, dtype=np.float32)
+        if mask.all():
+            raise PerceptionError("every pixel of the tactile image counts as marker or as unusable")
+        image = np.require(image, np.uint8, ["C", "W"])  # one kind of array for the compiled loops
+        ratio = _ratio(image, self._background, self.step)
         if self._calm is None:  # first frame: calm gel, gain and tilt are found together
-            self._measure(ratio, mask, uv_px)
+            self._measure(ratio, np.ones(3), mask, uv_px)
             for _ in range(_FIRST_ROUNDS):
                 self._lamps.forget()
                 self._level.forget()
-                self._measure(self._lit(ratio, mask), mask, uv_px)
-        return self._measure(self._lit(ratio, mask), mask, uv_px)
+                self._measure(ratio, self._gain(ratio, mask), mask, uv_px)
+        return self._measure(ratio, self._gain(ratio, mask), mask, uv_px)
 
-    def _lit(self, ratio: Float32Map, mask: BoolArray) -> Float32Map:
-        """A ratio image (h, w, 3) as if the lamps had not changed."""
+    def _gain(self, ratio: Float32Map, mask: BoolArray) -> FloatArray:
+        """What the lamps have changed by, (3,)."""
         assert self._calm is not None
-        return self._lamps.correct(ratio, self._calm & ~mask, self._lean_little & ~mask)
+        return self._lamps.update(ratio, self._calm & ~mask, self._lean_little & ~mask)
 
-    def _measure(self, ratio: Float32Map, mask: BoolArray, uv_px: FloatArray) -> DepthMap:
-        """Depth from a ratio image (h, w, 3) that lamps no longer disturb; remembers slopes and calm gel."""
-        self._slopes = smooth_fill(self._network(ratio) - self._flat, mask)  # (h, w, 2)
+    def _measure(self, ratio: Float32Map, gain: FloatArray, mask: BoolArray, uv_px: FloatArray) -> DepthMap:
+        """Depth from a ratio image (h, w, 3) and the lamps' gain (3,); remembers slopes and calm gel."""
+        slopes, weight = _change_beside(self._network(ratio, gain), self._flat, mask)  # (2, h, w), (h, w)
+        pull_push(slopes, weight)
         if self._dot_fill is not None:
-            self._dot_fill.apply(self._slopes, (uv_px - (self.step - 1) / 2) / self.step)
-        h = -self._solver.integrate(self._slopes[..., 0], self._slopes[..., 1])
-        untouched, _ = untouched_gel(h, self._slopes)
+            self._dot_fill.apply(slopes, (uv_px - (self.step - 1) / 2) / self.step)
+        self._slopes = slopes
+        h = self._solver.integrate(slopes[0], slopes[1])
+        np.negative(h, out=h)
+        untouched, _ = untouched_of(h, slopes)
         visible = float(untouched.mean()) > _VISIBLE
         h = self._level.apply(h, untouched if visible else None)
-        steepness = np.maximum(np.abs(self._slopes[..., 0]), np.abs(self._slopes[..., 1]))
-        steepness = cv2.blur(steepness, (5, 5))
+        steepness = cv2.blur(np.abs(slopes).max(axis=0), (5, 5))
         self._calm = untouched & (steepness < _CALM) & visible
         self._lean_little = np.asarray(steepness < _LEANS)
         return DepthMap(depth_m=h, untouched=untouched, zero_visible=visible)
 
     def expect_dots(self, radius_px: float) -> None:
         """Say how large the masked discs of dots are."""
-        self._dot_fill = DotFill(self.shape, (radius_px + 0.75 * self.step) / self.step)
+        self._dot_fill = DotFill((radius_px + 0.75 * self.step) / self.step)
 
     def at(self, depth: DepthMap, uv_px: FloatArray) -> FloatArray:
         """Depth (n,) m at image positions (n, 2)."""
@@ -115,19 +123,19 @@ class FullDepth:
         The fill's error grows with how much the slope varies around the dot.
         """
         ring = radius_px + self.step
-        around = uv_px[:, None] + ring * _RING[None]  # (n, 8, 2)
-        flat = around.reshape(-1, 2)
-        samples = [sample_map(self._slopes[..., c], flat, self.step).reshape(-1, len(_RING)) for c in (0, 1)]
+        around = (uv_px[:, None] + ring * _RING[None]).reshape(-1, 2)  # (8 n, 2)
+        samples = [sample_map(s, around, self.step).reshape(-1, len(_RING)) for s in self._slopes]
         variation = np.sqrt(sum(np.var(s, axis=1) for s in samples))  # (n,) m/m
         fill = _FILL_SHARE * variation * radius_px * self._s
         return np.asarray(np.sqrt(_NOISE_M**2 + (_DEPTH_SHARE * depth_m) ** 2 + fill**2))
 
-    def _network(self, ratio: Float32Map) -> Float32Map:
-        colours = ratio - 1.0 if self._gel.convention.background == "ratio" else ratio * self._background
-        slopes = self._gel.slopes(
-            np.ascontiguousarray(colours.reshape(-1, 3), dtype=np.float32), self._unit_uv
-        )
-        return slopes.reshape(*ratio.shape[:2], 2)
+    def _network(self, ratio: Float32Map, gain: FloatArray) -> Float32Map:
+        """Slopes (h, w, 2) of a ratio image (h, w, 3) under lamps with a gain (3,)."""
+        if self._gel.convention.background == "ratio":
+            slopes = self._gel.slopes(ratio.reshape(-1, 3), self._unit_uv, gain, -1.0)
+        else:
+            slopes = self._gel.slopes((ratio * self._background).reshape(-1, 3), self._unit_uv, gain)
+        return slopes.reshape(*self.shape, 2)
 
     def _shrink(self, image: Float32Map) -> Float32Map:
         """Means over step × step pixels."""
@@ -135,3 +143,40 @@ class FullDepth:
         if self.step == 1:
             return cropped
         return np.asarray(cv2.resize(cropped, self._size, interpolation=cv2.INTER_AREA), dtype=np.float32)
+
+
+@compiled
+def _ratio(image: Image, background: Float32Map, step: int) -> Float32Map:
+    """Means over step × step pixels of an image (H, W, 3) over the background (h, w, 3)."""
+    h, w = background.shape[0], background.shape[1]
+    ratio = np.empty((h, w, 3), dtype=np.float32)
+    share = np.float32(1.0 / (step * step))
+    n = 3 * w * step
+    line = np.empty(n, dtype=np.int32)
+    for v in range(h):
+        line[:] = 0
+        for j in range(step):
+            row = image[v * step + j].ravel()
+            for i in range(n):
+                line[i] += row[i]
+        for u in range(w):
+            for c in range(3):
+                total = line[3 * step * u + c]
+                for i in range(1, step):
+                    total += line[3 * (step * u + i) + c]
+                ratio[v, u, c] = share * np.float32(total) / background[v, u, c]
+    return ratio
+
+
+@compiled
+def _change_beside(slopes: Float32Map, flat: Float32Map, mask: BoolArray) -> tuple[Float32Map, Float32Map]:
+    """Slopes minus those of flat gel, (2, h, w), 0 under the mask, and weights (h, w): 1 off the mask."""
+    h, w = mask.shape
+    change, weight = np.zeros((2, h, w), dtype=np.float32), np.zeros((h, w), dtype=np.float32)
+    for v in range(h):
+        for u in range(w):
+            if not mask[v, u]:
+                weight[v, u] = 1.0
+                change[0, v, u] = slopes[v, u, 0] - flat[v, u, 0]
+                change[1, v, u] = slopes[v, u, 1] - flat[v, u, 1]
+    return change, weight

@@ -11,11 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tiptrace.errors import PerceptionError
+from tiptrace.perception.compiled import compiled
+from tiptrace.perception.gel_graph import MAX_BYTES, check_graph
+from tiptrace.types import FloatArray
 
 Float32Array = NDArray[np.float32]
 
 METADATA_PREFIX = "tiptrace."
 MAX_SLOPE = 4.0  # 76°: no gel stays in contact with anything steeper
+_STEEPEST = np.float32(1.33)  # rad
+_OUTPUTS = ("normals", "slopes", "angles")
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +77,7 @@ class Convention:
                 raise PerceptionError(
                     f"{source}: gel model has {f.name} = '{text}'; known: {', '.join(options)}"
                 )
-            values[f.name] = text if options else float(text)
+            values[f.name] = text if options else _positive(text, f"{source}: gel model's {f.name}")
         return cls(**values)
 
 
@@ -87,6 +92,7 @@ class GelModel:
         """
         import onnxruntime as ort
 
+        check_graph(onnx_bytes, source)
         options = ort.SessionOptions()
         options.intra_op_num_threads = 1
         options.inter_op_num_threads = 1
@@ -115,44 +121,126 @@ class GelModel:
         text = self.metadata.get(METADATA_PREFIX + "mm_per_px")
         if text is None:
             return None
-        x, y = (float(part) for part in text.split(","))
-        return x, y
+        x, comma, y = text.partition(",")
+        where = f"{self.source}: gel model's mm_per_px"
+        return _positive(x, where), _positive(y if comma else x, where)
 
     def raw(self, features: Float32Array) -> Float32Array:
-        """The network itself: (n, 5) → (n, 2)."""
-        result: Float32Array = self._session.run([self._output], {self._input: features})[0]
+        """The network itself: (n, 5) → (n, 2).
+
+        Raises:
+            PerceptionError: its layers do not fit together.
+        """
+        try:
+            result: Float32Array = self._session.run([self._output], {self._input: features})[0]
+        except Exception as error:  # noqa: BLE001  (onnxruntime raises many types, some of them bare)
+            raise PerceptionError(
+                f"{self.source}: gel model cannot be run ({(str(error).splitlines() or [''])[0]})"
+            ) from None
+        if result.shape != (len(features), 2) or result.dtype != np.float32:
+            raise PerceptionError(
+                f"{self.source}: gel model gives {result.dtype} {result.shape} for {len(features)} pixels, "
+                f"expected float32 ({len(features)}, 2)"
+            )
         return result
 
-    def slopes(self, colours: Float32Array, unit_uv: Float32Array) -> Float32Array:
+    def slopes(
+        self,
+        colours: Float32Array,
+        unit_uv: Float32Array,
+        gain: FloatArray | None = None,
+        offset: float = 0.0,
+    ) -> Float32Array:
         """Slopes (∂z/∂x, ∂z/∂y), (n, 2) m/m, of the gel surface (z out of the gel).
 
         Args:
             colours: (n, 3) in BGR order: grey levels 0 … 255 for ``background: none``, else ratio minus 1.
             unit_uv: (n, 2) u/W, v/H.
+            gain: (3,) divides the colours; None: 1.
+            offset: Is then added.
         """
         c = self.convention
-        features = np.zeros((len(colours), 5), dtype=np.float32)
-        features[:, :3] = colours if c.channels == "bgr" else colours[:, ::-1]
+        scale = np.ones(3) if gain is None else 1.0 / gain
         if c.background == "none":
-            features[:, :3] *= np.float32(1.0 / c.input_scale)
-        if c.coordinates == "unit":
-            features[:, 3:] = unit_uv
-        return self._to_slopes(self.raw(features))
+            scale, offset = scale / c.input_scale, offset / c.input_scale
+        features = _features(
+            np.ascontiguousarray(colours, dtype=np.float32),
+            np.ascontiguousarray(unit_uv, dtype=np.float32),
+            scale.astype(np.float32),
+            np.float32(offset),
+            c.channels == "rgb",
+            c.coordinates == "unit",
+        )
+        out = np.ascontiguousarray(self.raw(features))
+        _to_slopes(out, _OUTPUTS.index(c.output), np.float32(-1.0 if c.z_axis == "in" else 1.0))
+        return out
 
-    def _to_slopes(self, out: Float32Array) -> Float32Array:
-        if self.convention.output == "slopes":
-            slopes = out
-        elif self.convention.output == "angles":
-            slopes = np.tan(np.clip(out, -1.33, 1.33))
-        else:
-            n_z2 = np.float32(1.0) - out[:, 0] * out[:, 0] - out[:, 1] * out[:, 1]
-            slopes = np.asarray(-out / np.sqrt(np.maximum(n_z2, 0.05))[:, None], dtype=np.float32)  # (n, 2)
-        if self.convention.z_axis == "in":
-            slopes = -slopes
-        if not np.isfinite(slopes.sum()):
-            slopes = np.nan_to_num(slopes, nan=0.0)
-        bounded: Float32Array = np.clip(slopes, -MAX_SLOPE, MAX_SLOPE)
-        return bounded
+
+@compiled
+def _features(
+    colours: Float32Array,
+    unit_uv: Float32Array,
+    scale: Float32Array,
+    offset: np.float32,
+    reverse: bool,
+    placed: bool,
+) -> Float32Array:
+    """Network inputs (n, 5): colours scaled and ordered, and the place where it counts."""
+    n = len(colours)
+    features = np.zeros((n, 5), dtype=np.float32)
+    for c in range(3):
+        k = 2 - c if reverse else c
+        for i in range(n):
+            features[i, k] = colours[i, c] * scale[c] + offset
+    if placed:
+        for i in range(n):
+            features[i, 3] = unit_uv[i, 0]
+            features[i, 4] = unit_uv[i, 1]
+    return features
+
+
+@compiled
+def _to_slopes(out: Float32Array, kind: int, sign: np.float32) -> None:
+    """Network outputs (n, 2) of a kind (index in the list of outputs) to bounded slopes, in place."""
+    most, least_n_z2 = np.float32(MAX_SLOPE), np.float32(0.05)
+    for i in range(len(out)):
+        a, b = out[i, 0], out[i, 1]
+        if kind == 0:
+            n_z2 = np.float32(1.0) - a * a - b * b
+            scale = np.float32(-1.0) / np.sqrt(max(n_z2, least_n_z2))
+            a, b = a * scale, b * scale
+        elif kind == 2:
+            a, b = np.tan(min(max(a, -_STEEPEST), _STEEPEST)), np.tan(min(max(b, -_STEEPEST), _STEEPEST))
+        out[i, 0] = min(max(sign * a, -most), most) if np.isfinite(a) else np.float32(0.0)
+        out[i, 1] = min(max(sign * b, -most), most) if np.isfinite(b) else np.float32(0.0)
+
+
+def _positive(text: str, where: str) -> float:
+    """A number from a model's metadata.
+
+    Raises:
+        PerceptionError: it is none, or not positive and finite.
+    """
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0.0 < value < np.inf:
+        raise PerceptionError(f"{where} is {text[:40]!r}, expected a positive number")
+    return value
+
+
+def _read(path: Path) -> bytes:
+    """Bytes of a model file, no more of them than one has.
+
+    Raises:
+        PerceptionError: cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            return file.read(MAX_BYTES + 1)
+    except OSError as error:
+        raise PerceptionError(f"{path}: cannot be read ({error.strerror})") from None
 
 
 def load_gel_model(name_or_path_or_bytes: str | Path | bytes) -> GelModel:
@@ -163,15 +251,18 @@ def load_gel_model(name_or_path_or_bytes: str | Path | bytes) -> GelModel:
     """
     if isinstance(name_or_path_or_bytes, bytes):
         return GelModel(name_or_path_or_bytes, "attached gel model")
-    path = Path(name_or_path_or_bytes)
-    if path.is_file():
-        return GelModel(path.read_bytes(), str(path))
+    try:
+        path, found = Path(name_or_path_or_bytes), Path(name_or_path_or_bytes).is_file()
+    except (ValueError, OSError):  # a zero byte, a name too long
+        path, found = Path(), False
+    if found:
+        return GelModel(_read(path), str(path))
     folder = files("tiptrace") / "models"
-    packaged = folder / f"{name_or_path_or_bytes}.onnx"
-    if packaged.is_file():
-        return GelModel(packaged.read_bytes(), str(name_or_path_or_bytes))
     known = [f.name for f in folder.iterdir()] if folder.is_dir() else []
+    if f"{name_or_path_or_bytes}.onnx" in known:
+        packaged = folder / f"{name_or_path_or_bytes}.onnx"
+        return GelModel(packaged.read_bytes(), str(name_or_path_or_bytes))
     names = ", ".join(sorted(n.removesuffix(".onnx") for n in known if n.endswith(".onnx")))
     raise PerceptionError(
-        f"gel model '{name_or_path_or_bytes}' is neither a file nor a packaged model ({names or 'none'})"
+        f"gel model '{str(name_or_path_or_bytes)[:200]}' is neither a file nor a packaged model ({names or 'none'})"
     )

@@ -15,12 +15,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tiptrace.perception.compiled import compiled
 from tiptrace.types import BoolArray, FloatArray
 
 Float32Map = NDArray[np.float32]
 
 _BLOCK = 8  # map pixels
 _LEAST_BLOCKS = 10
+_LEAST_SHARE = 0.4  # of a block's pixels
 _PROBE = 0.03  # change of a channel's ratio by which the network's sensitivity is measured
 _TILT_SIGMA = 10e-3  # what lamps and network may tilt a depth map by, m/m
 _LEVEL_SIGMA_M = 10e-6  # how far untouched gel may lie from 0 beside a contact
@@ -45,15 +47,15 @@ class LampGain:
         self._gain_0 = np.ones(3)
         self.gain: FloatArray = np.ones(3)
 
-    def correct(self, ratio: Float32Map, calm: BoolArray, flat: BoolArray) -> Float32Map:
-        """Divide a ratio image (H, W, 3) by the lamps' gain.
+    def update(self, ratio: Float32Map, calm: BoolArray, flat: BoolArray) -> FloatArray:
+        """Gain (3,) of the channels in the next image.
 
         Args:
-            ratio: Image over the untouched background.
+            ratio: (H, W, 3) image over the untouched background.
             calm: (H, W) untouched gel; empty where none is visible.
             flat: (H, W) gel that leans little, pressed in or not; it tells a common gain where there is no calm gel.
         """
-        means, good = self._blocks(ratio, calm)
+        means, good = _block_means(ratio, calm, *self._size)
         if int(good.sum()) < _LEAST_BLOCKS:
             self._from_flat(ratio, flat)
         elif self._first is None:
@@ -67,14 +69,14 @@ class LampGain:
                 self.gain = self._gain_0 * np.median(means[both] / means_0[both], axis=0)
             else:
                 self._from_flat(ratio, flat)
-        return np.asarray(ratio / self.gain.astype(np.float32), dtype=np.float32)
+        return self.gain
 
     def forget(self) -> None:
         """Start anew with the next image."""
         self._first = None
 
     def _from_flat(self, ratio: Float32Map, flat: BoolArray) -> None:
-        means, good = self._blocks(ratio, flat)
+        means, good = _block_means(ratio, flat, *self._size)
         if int(good.sum()) >= _LEAST_BLOCKS:
             self.gain = np.full(3, 1.0 + self._common_change(means[good] - 1.0, self._not_slope[good]))
 
@@ -87,13 +89,6 @@ class LampGain:
         order = np.argsort(each)
         half = np.searchsorted(np.cumsum(weight[order]), 0.5 * weight.sum())
         return float(each[order[min(int(half), len(each) - 1)]])  # weighted median
-
-    def _blocks(self, ratio: Float32Map, calm: BoolArray) -> tuple[FloatArray, BoolArray]:
-        """Mean ratio over the calm pixels of each block, (b, 3), and which blocks have enough of them."""
-        weight = calm.astype(np.float32)
-        share = cv2.resize(weight, self._size, interpolation=cv2.INTER_AREA).ravel()
-        total = cv2.resize(ratio * weight[..., None], self._size, interpolation=cv2.INTER_AREA).reshape(-1, 3)
-        return total / np.maximum(share, 1e-3)[:, None], np.asarray(share > 0.4)
 
     def _directions(
         self, shape: tuple[int, int], slopes_of: Callable[[Float32Map], Float32Map]
@@ -111,14 +106,35 @@ class LampGain:
         return np.asarray(n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-9), dtype=np.float64)
 
 
+@compiled
+def _block_means(ratio: Float32Map, use: BoolArray, columns: int, rows: int) -> tuple[FloatArray, BoolArray]:
+    """Mean ratio over the used pixels of each block, (b, 3), and which blocks have enough of them."""
+    H, W = use.shape
+    total = np.zeros((rows * columns, 3), dtype=np.float32)
+    used, all_of = np.zeros(rows * columns), np.zeros(rows * columns)
+    for v in range(H):
+        for u in range(W):
+            b = (v * rows // H) * columns + u * columns // W
+            all_of[b] += 1.0
+            if use[v, u]:
+                used[b] += 1.0
+                for c in range(3):
+                    total[b, c] += ratio[v, u, c]
+    means = np.empty((rows * columns, 3))
+    for b in range(rows * columns):
+        for c in range(3):
+            means[b, c] = total[b, c] / max(used[b], 1.0)
+    return means, used > _LEAST_SHARE * all_of
+
+
 class Level:
     """Plane through untouched gel, taken away from depth maps; its tilt is averaged over frames."""
 
     def __init__(self, shape: tuple[int, int], metres_per_px: tuple[float, float]) -> None:
         """For maps of shape (H, W)."""
         H, W = shape
-        self._x = (np.arange(W) - (W - 1) / 2) * metres_per_px[0]
-        self._y = (np.arange(H) - (H - 1) / 2) * metres_per_px[1]
+        self._x: FloatArray = (np.arange(W) - (W - 1) / 2) * np.float64(metres_per_px[0])
+        self._y: FloatArray = (np.arange(H) - (H - 1) / 2) * np.float64(metres_per_px[1])
         self._tilt: FloatArray | None = None
 
     def apply(self, h: Float32Map, untouched: BoolArray | None) -> Float32Map:
@@ -127,32 +143,96 @@ class Level:
         Where none is visible (None), the last tilt is taken away and the border's lowest decile is 0.
         """
         if untouched is not None:
-            tilt = self._plane(h, untouched)
+            tilt = _plane_tilt(h, untouched, self._x, self._y)
             self._tilt = tilt if self._tilt is None else self._tilt + _TILT_RATE * (tilt - self._tilt)
-        z = h
-        if self._tilt is not None:
-            z = h - self._tilt[0] * self._x[None, :] - self._tilt[1] * self._y[:, None]
+        tilt = np.zeros(2) if self._tilt is None else self._tilt
+        z = _without_tilt(h, self._x, self._y, tilt)
         if untouched is not None:
-            zero = np.median(z[untouched])
+            zero = _median_of(z, untouched)
         else:
-            zero = np.percentile(np.concatenate([z[0], z[-1], z[:, 0], z[:, -1]]), 10)
-        return np.asarray(z - zero, dtype=np.float32)
+            zero = float(np.percentile(np.concatenate([z[0], z[-1], z[:, 0], z[:, -1]]), 10))
+        z -= np.float32(zero)
+        return z
 
     def forget(self) -> None:
         """Start anew with the next map."""
         self._tilt = None
 
-    def _plane(self, h: Float32Map, untouched: BoolArray) -> FloatArray:
-        """Tilt (2,) of the robust plane, with a prior of zero: gel seen on one side only hardly tilts the rest."""
-        v, u = np.nonzero(untouched[::_THIN, ::_THIN])
-        z = h[::_THIN, ::_THIN][v, u].astype(np.float64)
-        A = np.stack([np.ones(len(v)), self._x[_THIN * u], self._y[_THIN * v]], axis=1)  # (n, 3)
-        prior = np.diag([0.0, 1.0, 1.0]) * (_LEVEL_SIGMA_M / _TILT_SIGMA) ** 2 / _INDEPENDENT
-        w = np.ones(len(v))
-        x: FloatArray = np.zeros(3)
-        for _ in range(3):
-            w = w / w.mean()
-            x = np.linalg.solve((A.T * w) @ A / len(v) + prior, (A.T * w) @ z / len(v))
-            r = np.abs(z - A @ x)
-            w = 1.0 / np.maximum(1.0, r / (2.0 * float(np.median(r)) + 1e-7))
-        return x[1:]
+
+@compiled
+def _plane_tilt(h: Float32Map, untouched: BoolArray, x: FloatArray, y: FloatArray) -> FloatArray:
+    """Tilt (2,) of the robust plane, with a prior of zero: gel seen on one side only hardly tilts the rest."""
+    H, W = h.shape
+    n = 0
+    for v in range(0, H, _THIN):
+        for u in range(0, W, _THIN):
+            n += untouched[v, u]
+    A, z, w = np.empty((n, 2)), np.empty(n), np.ones(n)
+    n = 0
+    for v in range(0, H, _THIN):
+        for u in range(0, W, _THIN):
+            if untouched[v, u]:
+                A[n, 0], A[n, 1], z[n] = x[u], y[v], h[v, u]
+                n += 1
+    tilt = np.zeros(2)
+    if n == 0:
+        return tilt
+    prior = (_LEVEL_SIGMA_M / _TILT_SIGMA) ** 2 / _INDEPENDENT
+    for _ in range(3):
+        tilt, zero = _weighted_plane(A, z, w, prior)
+        r = np.abs(z - zero - A[:, 0] * tilt[0] - A[:, 1] * tilt[1])
+        scale = 2.0 * np.median(r) + 1e-7
+        for i in range(n):
+            w[i] = 1.0 / max(1.0, r[i] / scale)
+    return tilt
+
+
+@compiled
+def _weighted_plane(A: FloatArray, z: FloatArray, w: FloatArray, prior: float) -> tuple[FloatArray, float]:
+    """Tilt (2,) and offset of z ≈ offset + A · tilt with weights (n,) and a prior weight for no tilt."""
+    total, a, b, c = 0.0, 0.0, 0.0, 0.0
+    for i in range(len(w)):
+        total += w[i]
+        a += w[i] * A[i, 0]
+        b += w[i] * A[i, 1]
+        c += w[i] * z[i]
+    a, b, c = a / total, b / total, c / total
+    aa, ab, bb, az, bz = prior, 0.0, prior, 0.0, 0.0
+    for i in range(len(w)):
+        da, db, dz = A[i, 0] - a, A[i, 1] - b, z[i] - c
+        aa += w[i] * da * da / total
+        ab += w[i] * da * db / total
+        bb += w[i] * db * db / total
+        az += w[i] * da * dz / total
+        bz += w[i] * db * dz / total
+    determinant = aa * bb - ab * ab
+    tilt = np.array([(bb * az - ab * bz) / determinant, (aa * bz - ab * az) / determinant])
+    return tilt, c - a * tilt[0] - b * tilt[1]
+
+
+@compiled
+def _without_tilt(h: Float32Map, x: FloatArray, y: FloatArray, tilt: FloatArray) -> Float32Map:
+    H, W = h.shape
+    z = np.empty((H, W), dtype=np.float32)
+    slope, row = np.float32(tilt[0]), np.empty(W, dtype=np.float32)
+    for u in range(W):
+        row[u] = slope * np.float32(x[u])
+    for v in range(H):
+        rise = np.float32(tilt[1] * y[v])
+        for u in range(W):
+            z[v, u] = h[v, u] - row[u] - rise
+    return z
+
+
+@compiled
+def _median_of(z: Float32Map, untouched: BoolArray) -> float:
+    """Median over untouched gel, at every second pixel both ways."""
+    H, W = z.shape
+    values = np.empty(((H + 1) // 2) * ((W + 1) // 2), dtype=np.float32)
+    n = 0
+    for v in range(0, H, 2):
+        for u in range(0, W, 2):
+            if untouched[v, u]:
+                values[n] = z[v, u]
+                n += 1
+    return np.median(values[: max(n, 1)]) if n else 0.0

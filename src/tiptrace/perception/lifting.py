@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tiptrace.errors import PerceptionError
+from tiptrace.perception.compiled import compiled
 from tiptrace.types import FloatArray
 
 
@@ -14,17 +15,24 @@ def sample_map(values: NDArray[np.float32], uv_px: FloatArray, step: int = 1) ->
 
     ``step``: the map has one value for each block of step × step image pixels, at the block's centre.
     """
+    return _sample(np.ascontiguousarray(values), np.ascontiguousarray(uv_px, dtype=np.float64), step)
+
+
+@compiled
+def _sample(values: NDArray[np.float32], uv_px: FloatArray, step: int) -> FloatArray:
     H, W = values.shape
-    u = np.clip((uv_px[:, 0] - (step - 1) / 2) / step, 0.0, W - 1.0)
-    v = np.clip((uv_px[:, 1] - (step - 1) / 2) / step, 0.0, H - 1.0)
-    lost = ~np.isfinite(u + v)
-    u, v = np.where(lost, 0.0, u), np.where(lost, 0.0, v)
-    u0 = np.minimum(u.astype(np.intp), max(W - 2, 0))
-    v0 = np.minimum(v.astype(np.intp), max(H - 2, 0))
-    a, b = u - u0, v - v0
-    top = (1 - a) * values[v0, u0] + a * values[v0, u0 + 1]
-    bottom = (1 - a) * values[v0 + 1, u0] + a * values[v0 + 1, u0 + 1]
-    return np.asarray(np.where(lost, np.nan, (1 - b) * top + b * bottom), dtype=np.float64)
+    samples = np.full(len(uv_px), np.nan)
+    for i in range(len(uv_px)):
+        if np.isnan(uv_px[i, 0] + uv_px[i, 1]):
+            continue
+        u = min(max((uv_px[i, 0] - (step - 1) / 2) / step, 0.0), W - 1.0)
+        v = min(max((uv_px[i, 1] - (step - 1) / 2) / step, 0.0), H - 1.0)
+        u0, v0 = min(int(u), W - 2), min(int(v), H - 2)
+        a, b = u - u0, v - v0
+        top = (1 - a) * values[v0, u0] + a * values[v0, u0 + 1]
+        bottom = (1 - a) * values[v0 + 1, u0] + a * values[v0 + 1, u0 + 1]
+        samples[i] = (1 - b) * top + b * bottom
+    return samples
 
 
 def lift(

@@ -5,11 +5,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from tiptrace.perception.compiled import compiled
 from tiptrace.types import BoolArray, FloatArray
 
 _NEIGHBOURS = 8
 _DAMPING = 0.4  # of the affine part, in neighbours: few or one-sided neighbours predict their mean
 _SWEEPS = 30
+_SETTLED_PX = 0.02  # change of a sweep below which no further one is made
 
 
 class Neighbourhood:
@@ -21,7 +23,9 @@ class Neighbourhood:
         distance = np.linalg.norm(rest_px[:, None] - rest_px[None], axis=2)
         np.fill_diagonal(distance, np.inf)
         k = min(_NEIGHBOURS, n - 1)
-        self.neighbours: NDArray[np.intp] = np.argsort(distance, axis=1)[:, :k]  # (n, k)
+        self.neighbours: NDArray[np.intp] = np.ascontiguousarray(
+            np.argsort(distance, axis=1)[:, :k]
+        )  # (n, k)
         self.pitch_px = float(np.median(distance.min(axis=1)))
         rows = np.arange(n)[:, None]
         offset = (rest_px[self.neighbours] - rest_px[:, None]) / self.pitch_px  # (n, k, 2)
@@ -29,27 +33,57 @@ class Neighbourhood:
         w = 1.0 / (0.5 + distance[rows, self.neighbours] / self.pitch_px) ** 2  # (n, k)
         AtW = np.swapaxes(A, 1, 2) * w[:, None, :]  # (n, 3, k)
         M = AtW @ A + np.diag([1e-9, _DAMPING, _DAMPING])[None]
-        self._P = np.zeros((n, n))  # prediction = P @ displacement
-        self._P[rows, self.neighbours] = np.linalg.solve(M, AtW)[:, 0]
-        self._near = np.zeros((n, n))
-        self._near[rows, self.neighbours] = 1.0
+        self._P = np.ascontiguousarray(
+            np.linalg.solve(M, AtW)[:, 0]
+        )  # (n, k): prediction = P · displacements
 
     def predict(self, displacement_px: FloatArray, known: BoolArray) -> tuple[FloatArray, BoolArray]:
         """Displacement (n, 2) of every marker from its neighbours', and (n,) whether two of them are known.
 
         Unknown ones take part with what their own neighbours predict for them.
         """
-        enough = np.asarray(self._near @ known >= 2)
-        if not known.any():
-            return np.zeros_like(displacement_px), enough
-        x = np.where(known[:, None], displacement_px, displacement_px[known].mean(axis=0))
-        unknown = np.flatnonzero(~known)
-        if unknown.size:
-            P = self._P[unknown]
-            for _ in range(_SWEEPS):
-                step = P @ x
-                settled = np.abs(step - x[unknown]).max() < 0.02
-                x[unknown] = step
-                if settled:
-                    break
-        return self._P @ x, enough
+        return _predict(self._P, self.neighbours, np.ascontiguousarray(displacement_px), known)
+
+
+@compiled
+def _predict(
+    P: FloatArray, neighbours: NDArray[np.intp], displacement: FloatArray, known: BoolArray
+) -> tuple[FloatArray, BoolArray]:
+    n = len(known)
+    enough = np.zeros(n, dtype=np.bool_)
+    x, mean = displacement.copy(), np.zeros(2)
+    for i in range(n):
+        count = 0
+        for j in neighbours[i]:
+            count += known[j]
+        enough[i] = count >= 2
+        if known[i]:
+            mean += x[i]
+    mean /= max(known.sum(), 1)
+    for i in range(n):
+        if not known[i]:
+            x[i] = mean
+    for _ in range(_SWEEPS):
+        predicted = _from_neighbours(P, neighbours, x)
+        change = 0.0
+        for i in range(n):
+            if not known[i]:
+                change = max(change, abs(predicted[i, 0] - x[i, 0]), abs(predicted[i, 1] - x[i, 1]))
+                x[i] = predicted[i]
+        if change == 0.0:
+            return predicted, enough
+        if change < _SETTLED_PX:
+            break
+    return _from_neighbours(P, neighbours, x), enough
+
+
+@compiled
+def _from_neighbours(P: FloatArray, neighbours: NDArray[np.intp], x: FloatArray) -> FloatArray:
+    """Local affine fit (n, 2) of displacements x (n, 2), at each marker."""
+    predicted = np.zeros((len(P), 2))
+    for i in range(len(P)):
+        for k in range(P.shape[1]):
+            j = neighbours[i, k]
+            predicted[i, 0] += P[i, k] * x[j, 0]
+            predicted[i, 1] += P[i, k] * x[j, 1]
+    return predicted

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tiptrace.perception.centroid import DotMeasurement, DotMeter
+from tiptrace.perception.compiled import compiled
 from tiptrace.perception.markers import Markers
 from tiptrace.perception.neighbourhood import Neighbourhood
 from tiptrace.perception.tracking import Grey, grey_image, lucas_kanade
@@ -129,26 +130,25 @@ class RegisteredTracker:
         if not missing.size:
             return uv, seen
         uv, seen = uv.copy(), seen.copy()
-        smooth = cv2.GaussianBlur(grey, (0, 0), max(self._margin * 0.6, 0.8))
-        reach = int(np.ceil(_SEARCH * self._around.pitch_px))
-        H, W = grey.shape
         for i in missing:
-            u, v = np.round(guess[i]).astype(int)
-            u0, u1, v0, v1 = (
-                max(u - reach, 0),
-                min(u + reach + 1, W),
-                max(v - reach, 0),
-                min(v + reach + 1, H),
-            )
-            if u1 - u0 < 3 or v1 - v0 < 3:
-                continue
-            dark = np.unravel_index(int(np.argmin(smooth[v0:v1, u0:u1])), (v1 - v0, u1 - u0))
-            uv[i] = (u0 + dark[1], v0 + dark[0])
+            uv[i] = self._darkest(grey, guess[i])
         found = self._meter.measure(grey, uv[missing])
         uv[missing] = found.uv_px
         near = np.linalg.norm(found.uv_px - guess[missing], axis=1) < _FOUND * self._around.pitch_px
         seen[missing] = self._is_dot(found, missing, grey.shape) & near
         return uv, seen
+
+    def _darkest(self, grey: Grey, guess: FloatArray) -> tuple[int, int]:
+        """The darkest place (u, v) around a guess (2,) in the image, dots smoothed to one dip."""
+        sigma = max(self._margin * 0.6, 0.8)
+        reach, rim = int(np.ceil(_SEARCH * self._around.pitch_px)), int(np.ceil(3.0 * sigma))
+        u, v = round(guess[0]), round(guess[1])
+        u0, v0 = max(u - reach - rim, 0), max(v - reach - rim, 0)
+        smooth = cv2.GaussianBlur(grey[v0 : v + reach + rim + 1, u0 : u + reach + rim + 1], (0, 0), sigma)
+        u1, v1 = max(u - reach, 0), max(v - reach, 0)
+        core = smooth[v1 - v0 : v + reach + 1 - v0, u1 - u0 : u + reach + 1 - u0]
+        _, _, (x, y), _ = cv2.minMaxLoc(core)
+        return u1 + x, v1 + y
 
     def _agree(self, uv: FloatArray, seen: BoolArray) -> BoolArray:
         """Drop markers off their neighbours' displacement, worst first, and two markers on one dot."""
@@ -161,9 +161,15 @@ class RegisteredTracker:
                 break
             worst = off * bad
             seen &= ~(bad & (worst >= 0.7 * worst.max()))
-        distance = np.linalg.norm(uv[:, None] - uv[None], axis=2)
-        distance[~(seen[:, None] & seen[None])] = np.inf
-        np.fill_diagonal(distance, np.inf)
-        first, second = np.nonzero(np.triu(distance < self._margin))
-        seen[np.where(off[first] > off[second], first, second)] = False
+        _part_twins(uv, off, seen, self._margin)
         return seen
+
+
+@compiled
+def _part_twins(uv: FloatArray, off: FloatArray, seen: BoolArray, margin: float) -> None:
+    """Of two markers on one dot, unmark the one that is further off its neighbours' displacement."""
+    twice = seen.copy()
+    for i in range(len(uv)):
+        for j in range(i + 1, len(uv)):
+            if twice[i] and twice[j] and (uv[i, 0] - uv[j, 0]) ** 2 + (uv[i, 1] - uv[j, 1]) ** 2 < margin**2:
+                seen[i if off[i] > off[j] else j] = False
