@@ -84,10 +84,17 @@ class PoseFrames:
     end_effector: str | None = None
 
 
+FrameTap = Callable[[Frame], None]
+"""Sees each new frame at once, in the camera's thread, however late the loop takes it."""
+
+RobotTap = Callable[[RobotSample, int], None]
+"""The same for a robot's samples, with the instant of their arrival, ns."""
+
+
 class Camera(Protocol):
     """Delivers new frames; what is not new is counted and told, never delivered."""
 
-    def start(self, wake: Wake) -> None:
+    def start(self, wake: Wake, tap: FrameTap | None = None) -> None:
         """Connect and begin; returns when the first frame is here. ``wake`` is called when there is something.
 
         Raises:
@@ -116,7 +123,7 @@ class Robot(Protocol):
         """What the pose means, as far as known by now."""
         ...
 
-    def start(self, wake: Wake) -> None:
+    def start(self, wake: Wake, tap: RobotTap | None = None) -> None:
         """Connect and begin; returns when the first pose is here.
 
         Raises:

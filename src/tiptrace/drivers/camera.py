@@ -9,14 +9,14 @@ from typing import Protocol
 
 import numpy as np
 
-from tiptrace.drivers.base import Closing, DeviceHealth, DeviceStatus, Frame, Wake
+from tiptrace.drivers.base import Closing, DeviceHealth, DeviceStatus, Frame, FrameTap, Wake
 from tiptrace.drivers.meter import Meter
 from tiptrace.drivers.picture import Framing, Novelty, PictureError, decode_jpeg, encode_jpeg
 from tiptrace.drivers.timeline import NS, Timeline
 from tiptrace.errors import DeviceError
 from tiptrace.types import Image
 
-_QUEUE = 8  # frames: a third of a second; the oldest goes first
+_QUEUE = 50  # frames: two seconds, as the end of Stage I may take; the oldest goes first
 _LATE_NS = round(0.3 * NS)
 _FROZEN = 5  # repeats in a row
 _STALE_S = 0.25
@@ -103,12 +103,13 @@ class ThreadedCamera(Closing):
         self._repeats = 0
         self._last_ns = 0
         self._wake: Wake = lambda: None
+        self._frame_tap: FrameTap | None = None
         self._error: DeviceError | None = None
         self._thread: threading.Thread | None = None
 
-    def start(self, wake: Wake) -> None:
+    def start(self, wake: Wake, tap: FrameTap | None = None) -> None:
         """Connect and wait for the first frame."""
-        self._wake = wake
+        self._wake, self._frame_tap = wake, tap
         self._source.connect()
         self._thread = threading.Thread(target=self._run, name=f"camera {self.name}", daemon=True)
         self._thread.start()
@@ -194,6 +195,8 @@ class ThreadedCamera(Closing):
             self._meter.bad(DeviceStatus.GARBLED, f"{self.name}: an image {error}")
             return
         self._last_ns = raw.stamp_ns
+        if self._frame_tap is not None:
+            self._frame_tap(frame)
         with self._lock:
             if len(self._queue) >= _QUEUE:
                 self._queue.popleft()

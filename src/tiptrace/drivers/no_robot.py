@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tiptrace.drivers.base import Closing, DeviceHealth, DeviceStatus, PoseFrames, RobotSample, Wake
+from tiptrace.drivers.base import Closing, DeviceHealth, DeviceStatus, PoseFrames, RobotSample, RobotTap, Wake
 
 
 class NoRobot(Closing):
@@ -15,7 +15,7 @@ class NoRobot(Closing):
         """None."""
         return PoseFrames()
 
-    def start(self, wake: Wake) -> None:
+    def start(self, wake: Wake, tap: RobotTap | None = None) -> None:
         """Nothing to do."""
 
     def take(self) -> list[RobotSample]:

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import csv
 import threading
-from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
-from tiptrace.drivers.base import Closing, DeviceHealth, DeviceStatus, PoseFrames, RobotSample, Wake
+from tiptrace.drivers.base import Closing, DeviceHealth, DeviceStatus, PoseFrames, RobotSample, RobotTap, Wake
 from tiptrace.drivers.sample_queue import SampleQueue
 from tiptrace.drivers.timeline import NS, Timeline
 from tiptrace.errors import DeviceError, GeometryError
@@ -19,8 +18,6 @@ from tiptrace.types import PoseSample
 
 _COLUMNS = ("stamp_ns", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 _REACH_M = 3.0
-
-Begin = Callable[[], int]
 
 
 class ReplayRobot(Closing):
@@ -53,9 +50,9 @@ class ReplayRobot(Closing):
         """As the file says; a csv does not."""
         return self._frames
 
-    def start(self, wake: Wake) -> None:
+    def start(self, wake: Wake, tap: RobotTap | None = None) -> None:
         """Begin to play."""
-        self._queue.wake = wake
+        self._queue.wake, self._queue.tap = wake, tap
         self._thread = threading.Thread(target=self._run, name=self.name, daemon=True)
         self._thread.start()
         self._queue.first.wait(5.0)

@@ -7,7 +7,7 @@ from collections import deque
 
 import numpy as np
 
-from tiptrace.drivers.base import DeviceHealth, RobotSample, Wake
+from tiptrace.drivers.base import DeviceHealth, RobotSample, RobotTap, Wake
 from tiptrace.drivers.meter import Meter
 from tiptrace.drivers.timeline import NS, Timeline
 from tiptrace.errors import DeviceError
@@ -38,6 +38,7 @@ class SampleQueue:
         self._woken_ns = 0
         self._error: DeviceError | None = None
         self.wake: Wake = lambda: None
+        self.tap: RobotTap | None = None
         self.first = threading.Event()
 
     def put(self, sample: RobotSample) -> None:
@@ -51,6 +52,8 @@ class SampleQueue:
             self._last = sample
             self.meter.good(sample.stamp_ns, now_ns)
             self.first.set()
+        if self.tap is not None:
+            self.tap(sample, now_ns)
         with self._lock:
             if len(self._samples) >= _QUEUE:
                 self._samples.popleft()

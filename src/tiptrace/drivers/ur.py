@@ -12,7 +12,7 @@ from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 
-from tiptrace.drivers.base import Closing, DeviceHealth, DeviceStatus, PoseFrames, RobotSample, Wake
+from tiptrace.drivers.base import Closing, DeviceHealth, DeviceStatus, PoseFrames, RobotSample, RobotTap, Wake
 from tiptrace.drivers.sample_queue import SampleQueue
 from tiptrace.drivers.timeline import NS, ClockMap, Timeline
 from tiptrace.errors import ConfigError, DeviceError, MissingExtraError
@@ -64,9 +64,9 @@ class UrRobot(Closing):
         """The controller's base, the active TCP."""
         return PoseFrames("base", "tcp")
 
-    def start(self, wake: Wake) -> None:
+    def start(self, wake: Wake, tap: RobotTap | None = None) -> None:
         """Connect and wait for the first pose."""
-        self._queue.wake = wake
+        self._queue.wake, self._queue.tap = wake, tap
         receiver = self._connect()
         self._thread = threading.Thread(
             target=self._run, args=(receiver,), name=f"robot {self.name}", daemon=True

@@ -164,7 +164,8 @@ class LiveSession:
             if self.recorder is not None:
                 stack.enter_context(self.recorder)
             tracer = stack.enter_context(open_tracer(self.stream, self.method))
-            self.stream.discard()
+            if not self.stream.standby:
+                self.stream.begin()
             self.tracer, monitor = tracer, StageOneMonitor(tracer)
             if self.on_open is not None:
                 self.on_open()

@@ -8,11 +8,12 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from types import TracebackType
 from typing import Protocol, Self
 
 from tiptrace.config import Frames, Rig, Tool
-from tiptrace.drivers.base import Camera, DeviceHealth, DeviceStatus, Frame, PoseFrames, Robot
+from tiptrace.drivers.base import Camera, DeviceHealth, DeviceStatus, Frame, PoseFrames, Robot, RobotSample
 from tiptrace.drivers.timeline import Timeline
 from tiptrace.errors import ConfigError
 from tiptrace.streams.synchronise import LIVE, SyncSettings
@@ -21,15 +22,15 @@ from tiptrace.types import SIDES, Image, ImageSample, OpeningSample, Phase, Phas
 _IDLE_S = 0.2
 _WARM_UP_S, _WARM_UP_FRAMES = 2.0, 8
 _SPACING_SHARE = 0.85  # of the measured period between frames: closer ones do not come
-_ARRIVALS = 64
+_ARRIVALS = 256
 _ENDED_GRACE_S = 0.5
 
 
 class Tap(Protocol):
-    """Sees every sample on its way to the loop."""
+    """Sees every sample as it arrives, in the device's thread, even those that a busy loop has to skip."""
 
     def __call__(self, sample: Sample, log_time_ns: int, jpeg: bytes | None) -> None:
-        """Take a sample, when it was handed over, and an image's bytes."""
+        """Take a sample, when it arrived, and an image's bytes."""
         ...
 
 
@@ -49,7 +50,7 @@ class LiveStream:
     Attributes:
         settings: Limits of synchronisation that suit these cameras; final after entering.
         first_images: An image of each finger, after entering.
-        tap: Sees every sample on its way to the loop, as a recorder does.
+        tap: Sees every sample as it arrives, as a recorder does, from :meth:`begin` on.
         on_idle: Called several times a second from the loop.
         on_phase: Takes the phase marks that come with the robot's topics; without it they are delivered as they are.
     """
@@ -78,7 +79,8 @@ class LiveStream:
         self._cameras, self._robot = dict(cameras), robot
         self._wake, self._stop = threading.Event(), threading.Event()
         self._lock = threading.Lock()
-        self._marks: list[Phase] = []
+        self._marks: list[PhaseSample] = []
+        self._begin_ns: int | None = None
         self._arrived: OrderedDict[tuple[Side, int], int] = OrderedDict()
         self._devices = ExitStack()
 
@@ -94,10 +96,10 @@ class LiveStream:
         with ExitStack() as opened:
             check_frames(self._robot.frames, self.rig.frames)
             opened.callback(self._robot.close)
-            self._robot.start(self._wake.set)
+            self._robot.start(self._wake.set, self._tap_robot)
             for side in SIDES:
                 opened.callback(self._cameras[side].close)
-                self._cameras[side].start(self._wake.set)
+                self._cameras[side].start(self._wake.set, partial(self._tap_frame, side))
             self._warm_up()
             check_frames(self._robot.frames, self.rig.frames)
             self._devices = opened.pop_all()
@@ -124,11 +126,9 @@ class LiveStream:
         if len(known) == 2:
             self.settings = replace(LIVE, min_frame_spacing_s=_SPACING_SHARE / max(known))
 
-    def discard(self) -> None:
-        """Forget what has come so far: the loop begins with what comes from now on."""
-        for side in SIDES:
-            self._cameras[side].take()
-        self._robot.take()
+    def begin(self) -> None:
+        """From now on samples count; what was stamped before is neither delivered nor shown to the tap."""
+        self._begin_ns = self.timeline.now_ns()
 
     # --- control, from any thread --------------------------------------------------------------------------
 
@@ -139,8 +139,12 @@ class LiveStream:
 
     def mark(self, phase: Phase) -> None:
         """From now on the trial is in ``phase``."""
+        sample = PhaseSample(self.timeline.now_ns(), phase)
         with self._lock:
-            self._marks.append(phase)
+            self._marks.append(sample)
+            if self.standby:
+                self.standby, self._begin_ns = False, sample.stamp_ns
+        self._tap(sample, sample.stamp_ns, None)
         self._wake.set()
 
     def health(self) -> dict[str, DeviceHealth]:
@@ -161,16 +165,16 @@ class LiveStream:
             DeviceError: a device that is no longer what it was at the start.
             ConfigError: a pose that is no longer what the rig file means.
         """
+        if self._begin_ns is None:
+            self.begin()
         ended_at: float | None = None
         while True:
             stopping = self._stop.is_set()
             if not stopping:
                 self._wake.wait(_IDLE_S)
                 self._wake.clear()
-            samples = self._gather()
-            if not self.standby:
-                self._tap(samples)
-                for sample, _ in samples:
+            for sample in self._gather():
+                if self._counts(sample):
                     yield sample
             if stopping:
                 return
@@ -181,43 +185,41 @@ class LiveStream:
                 if time.monotonic() - ended_at > _ENDED_GRACE_S:
                     return
 
-    def _gather(self) -> list[tuple[Sample, bytes | None]]:
+    def _gather(self) -> list[Sample]:
         """What has come: marks and poses first, so that an image finds them there."""
-        found: list[tuple[Sample, bytes | None]] = []
         frames: list[tuple[int, Side, Frame]] = []
         for side in SIDES:
             frames += [(frame.arrived_ns, side, frame) for frame in self._cameras[side].take()]
-        poses = self._robot.take()
+        found: list[Sample] = []
+        for sample in self._robot.take():
+            if isinstance(sample, PhaseSample):
+                (self.on_phase or self.mark)(sample.phase)
+            else:
+                found.append(sample)
         check_frames(self._robot.frames, self.rig.frames)
-        if self.on_phase is not None:
-            for sample in poses:
-                if isinstance(sample, PhaseSample):
-                    self.on_phase(sample.phase)
-            poses = [sample for sample in poses if not isinstance(sample, PhaseSample)]
         with self._lock:
             marks, self._marks = self._marks, []
-        for phase in marks:
-            found.append((PhaseSample(self.timeline.now_ns(), phase), None))
-            self.standby = False
-        found += [(sample, None) for sample in poses]
         for arrived_ns, side, frame in sorted(frames, key=lambda item: item[0]):
             self._arrived[side, frame.stamp_ns] = arrived_ns
-            found.append((ImageSample(side, frame.stamp_ns, frame.image), frame.jpeg))
+            found.append(ImageSample(side, frame.stamp_ns, frame.image))
         while len(self._arrived) > _ARRIVALS:
             self._arrived.popitem(last=False)
-        return found
+        return [*marks, *found]
 
-    def _tap(self, samples: list[tuple[Sample, bytes | None]]) -> None:
-        """Show them to the tap at once, however long the loop takes over them.
+    def _counts(self, sample: Sample) -> bool:
+        return not self.standby and self._begin_ns is not None and sample.stamp_ns >= self._begin_ns
 
-        What has no header is dated by its log time; so live and recorded marks are the same.
-        """
-        if self.tap is None:
-            return
-        now_ns = self.timeline.now_ns()
-        for sample, jpeg in samples:
-            undated = isinstance(sample, PhaseSample | OpeningSample)
-            self.tap(sample, sample.stamp_ns if undated else now_ns, jpeg)
+    def _tap(self, sample: Sample, log_time_ns: int, jpeg: bytes | None) -> None:
+        if self.tap is not None and self._counts(sample):
+            self.tap(sample, log_time_ns, jpeg)
+
+    def _tap_frame(self, side: Side, frame: Frame) -> None:
+        self._tap(ImageSample(side, frame.stamp_ns, frame.image), self.timeline.now_ns(), frame.jpeg)
+
+    def _tap_robot(self, sample: RobotSample, arrived_ns: int) -> None:
+        """Phase marks come back through :meth:`mark`; openings are dated by their log time, here as offline."""
+        if not isinstance(sample, PhaseSample):
+            self._tap(sample, sample.stamp_ns if isinstance(sample, OpeningSample) else arrived_ns, None)
 
     def _ended(self) -> bool:
         return any(health.status is DeviceStatus.ENDED for health in self.health().values())
