@@ -11,7 +11,7 @@ from typing import Protocol
 from tiptrace.errors import PerceptionError, RecordingError
 from tiptrace.streams.sync_report import SyncReport
 from tiptrace.streams.synchronise import SyncSettings, synchronise
-from tiptrace.tracer import TipTracer, make_tracer
+from tiptrace.tracer import DEFAULT_OPTIONS, TipTracer, TracerOptions, make_tracer
 from tiptrace.types import Observation, Phase, SensedPair, Stream, TipEstimate, TipTrajectory
 
 STEPS = ("acquire", "sense", "estimate")
@@ -126,7 +126,7 @@ def replay(pairs: Iterable[SensedPair], tracer: TipTracer) -> TipTrajectory:
 
 
 @contextmanager
-def open_tracer(stream: Stream, method: str) -> Iterator[TipTracer]:
+def open_tracer(stream: Stream, method: str, options: TracerOptions = DEFAULT_OPTIONS) -> Iterator[TipTracer]:
     """A tracer with one thread per finger.
 
     Raises:
@@ -135,7 +135,7 @@ def open_tracer(stream: Stream, method: str) -> Iterator[TipTracer]:
     from concurrent.futures import ThreadPoolExecutor
 
     with ThreadPoolExecutor(max_workers=2, thread_name_prefix="finger") as pool:
-        yield make_tracer(stream, method, both=pool.map)
+        yield make_tracer(stream, method, both=pool.map, options=options)
 
 
 def _timed(observations: Iterator[Observation]) -> Iterator[tuple[Observation, float]]:

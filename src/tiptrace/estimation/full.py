@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -9,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from tiptrace.config import Rig, Tool
 from tiptrace.estimation.anchor import TipPrior
+from tiptrace.estimation.carry_over import StageTwoStep, carried_over
 from tiptrace.estimation.event_log import EventLog
 from tiptrace.estimation.integrity import Findings, IntegrityConfig, Monitor
 from tiptrace.estimation.motion import MotionConfig, Motions, TemplateFit
@@ -32,7 +34,8 @@ _TOO_FEW = "fewer markers than a rigid motion needs, or none on one pad"
 class FullConfig(BaseModel):
     """Settings of the full estimator; the defaults were chosen on simulated trials with seeds below 1000.
 
-    ``use_stage_one = False`` takes the tip from the tool's file (``--tip``).
+    ``use_stage_one = False`` takes the tip from the tool's file (``--tip``); with ``relative = True`` too the tip is
+    not asked for, and positions are displacements from the first contact.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -45,6 +48,7 @@ class FullConfig(BaseModel):
     phases: PhaseConfig = PhaseConfig()
     reanchor: ReanchorConfig = ReanchorConfig()
     use_stage_one: bool = True
+    relative: bool = False
     use_tip_prior: bool = True
     refuse_sigma_m: float = Field(default=2e-3, gt=0)
     slip_sigma_m: float = Field(default=1.5e-3, gt=0)
@@ -76,9 +80,10 @@ class FullEstimator:
         self._config = c = config or FullConfig()
         self._latency = calibrated_latency(rig)
         self._prior = tip_prior(tool) if c.use_tip_prior else None
-        self._given: TipPrior | Anchoring | None = (
-            anchor_from if anchor_from is not None else (None if c.use_stage_one else require_tip(tool))
-        )
+        self._given: TipPrior | Anchoring | None = anchor_from
+        if anchor_from is None and not c.use_stage_one and not c.relative:
+            self._given = require_tip(tool)
+        self._staged = self._given is None and c.use_stage_one
         self._track = PoseTrack(c.pose_memory_s, c.pose_half_width_s)
         self._stage_one = StageOne(c.stage_one, c.patch, c.motion, c.tip_map, c.pose_half_width_s)
         self._running = RunningTip(self._prior, c.tip_noise_m, c.tip_map.map_sigma)
@@ -95,6 +100,12 @@ class FullEstimator:
         self.events: list[Event] = []
         self._log = EventLog(self.events)
         self._verdict = Verdict(self._log, c.slip_sigma_m)
+        self.on_step: Callable[[StageTwoStep], None] | None = None  # for whoever smooths afterwards
+
+    @property
+    def anchoring_end_ns(self) -> int | None:
+        """End of Stage I where it was found from the data, ns; frames up to its detection came as anchoring."""
+        return self._phases.end_ns
 
     @property
     def anchor(self) -> Anchor | None:
@@ -127,7 +138,7 @@ class FullEstimator:
         self._track.extend(poses)
         repeated = self._monitor.repeated(markers.x_S, markers.pad)
         phase = pair.phase or self._phases.update(pair.stamp_ns, pair.left.T_B_E)
-        if phase is Phase.ANCHORING and self._given is None:
+        if phase is Phase.ANCHORING and self._staged:
             return self._stage_one_step(replace(pair, phase=phase, poses=poses), markers)
         if self._anchoring is None and not self._begin_stage_two(pair, poses, markers):
             return TipEstimate(self._exposure_ns(pair.stamp_ns), phase, Status.LOST)
@@ -161,7 +172,7 @@ class FullEstimator:
     def _begin_stage_two(self, pair: SensedPair, poses: tuple[PoseSample, ...], markers: PadMarkers) -> bool:
         """Solve Stage I, or stand in for it; False while there are too few frames for a template."""
         self._last_motion = None
-        if len(self._stage_one) >= _TEMPLATE_FRAMES and self._given is None:
+        if len(self._stage_one) >= _TEMPLATE_FRAMES and self._staged:
             if self._phases.end_ns is not None:
                 self._stage_one.keep_until(self._phases.end_ns)
             self._accept(self._stage_one.solve(self._latency, self._prior), pair.stamp_ns)
@@ -172,7 +183,7 @@ class FullEstimator:
             return False
         tip = self._given
         if isinstance(tip, Anchoring):
-            self._anchoring = tip.carried_over(pair.stamp_ns)
+            self._anchoring = carried_over(tip, self._stage_one, pair.stamp_ns, self._config.motion)
             return True
         if tip is None:
             self._relative = True
@@ -225,6 +236,7 @@ class FullEstimator:
             return estimate
         tip = self._propagate(pair.stamp_ns, motions, hand)
         status, extra = self._verdict.of(stamp_ns, self._judge(markers, motions, repeated))
+        self._report_step(pair.stamp_ns, motions, hand, extra)
         R_B_E = hand.T_B_E[0, :3, :3] @ motions.R[0]
         estimate = replace(estimate, status=status, R_B_E=R_B_E, residual_m=float(motions.residual_m[0]))
         self._try_reanchoring(pair, markers, tip.p_B, R_B_E)
@@ -234,6 +246,10 @@ class FullEstimator:
             return self._displacement(estimate, tip, extra)
         self._set_anchor_from_given(tip)
         return replace(estimate, p_B=tip.p_B, covariance=tip.covariance + extra)
+
+    def _report_step(self, stamp_ns: int, motions: Motions, hand: HandStates, extra: FloatArray) -> None:
+        if self.on_step is not None and self._anchoring is not None:
+            self.on_step(StageTwoStep(stamp_ns, motions, hand, self._anchoring, extra))
 
     def _propagate(self, stamp_ns: int, motions: Motions, hand: HandStates) -> Tip:
         assert self._anchoring is not None

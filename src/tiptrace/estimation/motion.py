@@ -82,6 +82,7 @@ class TemplateFit:
         """
         self._config = config
         self._all = M
+        self.pad, self.axes, self.trust = pad, axes, trust  # as given, so that a fit can be made again
         self._active = np.flatnonzero(np.isfinite(M).all(axis=1) & (trust > 0))  # rows in use
         self._M, self._trust, self._pad = M[self._active], trust[self._active], pad[self._active].astype(int)
         self._g = (
