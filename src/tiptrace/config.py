@@ -15,6 +15,7 @@ from tiptrace.types import SIDES, FloatArray, Side
 
 Vector3 = tuple[float, float, float]
 M = TypeVar("M", bound=BaseModel)
+_MAX_YAML_BYTES, _MAX_YAML_NODES = 200_000, 50_000
 _REACH_M = 3.0  # no arm that holds a GelSight Mini reaches further: longer vectors are millimetres
 
 
@@ -39,7 +40,7 @@ UnitQuaternion = Annotated[tuple[float, float, float, float], AfterValidator(_un
 
 
 class _Model(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class Transform(_Model):
@@ -74,7 +75,10 @@ class Camera(_Model):
 class Sensor(_Model):
     """One finger."""
 
-    image_size_px: tuple[Annotated[int, Field(gt=15)], Annotated[int, Field(gt=15)]] = (320, 240)
+    image_size_px: tuple[Annotated[int, Field(gt=15, le=4096)], Annotated[int, Field(gt=15, le=4096)]] = (
+        320,
+        240,
+    )
     mm_per_px: tuple[Annotated[float, Field(gt=0, lt=1)], Annotated[float, Field(gt=0, lt=1)]]
     T_E_S: Transform
     gel_model: str = "gelsight-mini-virtual"
@@ -193,16 +197,59 @@ class Tool(_Model):
     tip_radius_m: float | None = Field(default=None, ge=0, lt=0.05)
 
 
+def read_yaml(text: str | bytes, source: str) -> Any:
+    """Content of YAML text from anybody: plain data only, of a size that settings have.
+
+    Anchors and merge keys are fine, but a few lines of them can mean billions of values, or a value within
+    itself: what the text means is counted before any of it is made.
+
+    Raises:
+        ConfigError: not YAML, or too large.
+    """
+    if len(text) > _MAX_YAML_BYTES:
+        raise ConfigError(
+            f"{source}: {len(text)} bytes are no settings file (limit {_MAX_YAML_BYTES}); is it the right file?"
+        )
+    try:
+        loader = yaml.SafeLoader(text)
+        try:
+            node = loader.get_single_node()
+            if node is None:
+                return None
+            _count_nodes(node, {}, source)
+            return loader.construct_document(node)
+        finally:
+            loader.dispose()
+    except RecursionError:
+        raise ConfigError(f"{source}: not valid YAML (nested too deeply)") from None
+    except (yaml.YAMLError, ValueError, ArithmeticError, LookupError, TypeError) as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise ConfigError(f"{source}: not valid YAML ({reason})") from None
+
+
+def _count_nodes(node: yaml.Node, counted: dict[int, int], source: str) -> int:
+    """Values that a node stands for, aliases written out."""
+    key = id(node)
+    if key not in counted:
+        counted[key] = _MAX_YAML_NODES  # met again within itself: endless
+        children = node.value if isinstance(node, yaml.CollectionNode) else []
+        total = 1
+        for child in children:
+            for part in child if isinstance(child, tuple) else (child,):
+                total += _count_nodes(part, counted, source)
+        counted[key] = total
+    if counted[key] >= _MAX_YAML_NODES:
+        raise ConfigError(f"{source}: its aliases mean more than {_MAX_YAML_NODES} values; write them out")
+    return counted[key]
+
+
 def parse_yaml(model: type[M], text: str | bytes, source: str) -> M:
     """Validate YAML text against a model; ``source`` names the file in error messages.
 
     Raises:
         ConfigError: not YAML, an unknown key (the valid ones are listed), or a value out of range.
     """
-    try:
-        data: Any = yaml.safe_load(text)
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{source}: not valid YAML ({str(error).splitlines()[0]})") from None
+    data = read_yaml(text, source)
     if not isinstance(data, dict):
         raise ConfigError(f"{source}: expected a mapping of keys to values, got {type(data).__name__}")
     try:
@@ -218,7 +265,8 @@ def load_yaml(model: type[M], path: Path) -> M:
         ConfigError: see :func:`parse_yaml`; also a file that cannot be read.
     """
     try:
-        text = path.read_bytes()
+        with path.open("rb") as file:
+            text = file.read(_MAX_YAML_BYTES + 1)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
     return parse_yaml(model, text, str(path))
@@ -230,9 +278,9 @@ def dump_yaml(model: BaseModel) -> str:
 
 
 def _explain(model: type[BaseModel], error: ValidationError) -> str:
-    """One clear sentence per problem."""
+    """One clear sentence per problem, the first few of them."""
     problems = []
-    for item in error.errors():
+    for item in error.errors(include_url=False, include_input=False)[:8]:
         where = ".".join(str(part) for part in item["loc"]) or "file"
         if item["type"] == "extra_forbidden":
             valid = ", ".join(_keys_at(model, item["loc"][:-1]))

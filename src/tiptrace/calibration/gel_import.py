@@ -8,8 +8,10 @@ before anything is called.
 from __future__ import annotations
 
 import io
+import math
 import pickle
 import zipfile
+import zlib
 from collections import OrderedDict
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,6 +34,7 @@ CONVENTIONS: dict[str, Convention] = {
     "gs-sdk": Convention(channels="bgr", coordinates="unit", output="angles"),
 }
 
+_MAX_MEMBER_BYTES = 16_000_000
 _STORAGE_TYPES = {
     "FloatStorage": np.dtype("<f4"),
     "DoubleStorage": np.dtype("<f8"),
@@ -104,6 +107,10 @@ def read_torch_tensors(path: Path) -> dict[str, NDArray[Any]]:
         TypeError,
         AttributeError,
         IndexError,
+        ArithmeticError,
+        MemoryError,
+        RuntimeError,
+        zlib.error,
     ) as error:
         raise CalibrationError(f"{path}: its table of tensors cannot be read ({error})") from None
     if isinstance(content, dict) and isinstance(content.get("state_dict"), dict):
@@ -117,8 +124,15 @@ class _TensorReader(pickle.Unpickler):
     """An unpickler that knows tensors and nothing else."""
 
     def __init__(self, archive: zipfile.ZipFile, root: str, path: Path) -> None:
-        super().__init__(io.BytesIO(archive.read(root + "data.pkl")))
         self._archive, self._root, self._path = archive, root, path
+        super().__init__(io.BytesIO(self._member("data.pkl")))
+
+    def _member(self, name: str) -> bytes:
+        """A file of the archive, if it is no larger than weights are: packed, a gigabyte may be a few kilobytes."""
+        size = self._archive.getinfo(self._root + name).file_size
+        if size > _MAX_MEMBER_BYTES:
+            raise CalibrationError(f"{self._path}: {name} holds {size} bytes, too many for a gel network")
+        return self._archive.read(self._root + name)
 
     def find_class(self, module: str, name: str) -> Any:
         """Allow-list: every other name is refused."""
@@ -135,7 +149,7 @@ class _TensorReader(pickle.Unpickler):
     def persistent_load(self, pid: Any) -> NDArray[Any]:
         """One storage: ('storage', dtype, key, device, count)."""
         _, dtype, key, _, count = pid
-        data = self._archive.read(f"{self._root}data/{int(key)}")
+        data = self._member(f"data/{int(key)}")
         return np.frombuffer(data, dtype=dtype, count=int(count))
 
 
@@ -143,6 +157,8 @@ def _rebuild_tensor(
     storage: NDArray[Any], offset: int, size: tuple[int, ...], stride: tuple[int, ...], *_unused: Any
 ) -> NDArray[Any]:
     """A tensor as a copy, checked against its storage."""
+    if math.prod(size) > len(storage):
+        raise ValueError("a tensor has more numbers than its storage")
     last = offset + sum((n - 1) * s for n, s in zip(size, stride, strict=True))
     if offset < 0 or min((*size, 1)) < 0 or min((*stride, 0)) < 0 or last >= len(storage):
         raise ValueError("a tensor reaches outside its storage")

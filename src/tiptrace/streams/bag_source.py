@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from tiptrace.errors import RecordingError
+from tiptrace.streams.bag_checks import check_bag
 from tiptrace.streams.raw_messages import RawMessage
 from tiptrace.streams.topics import NS
 
@@ -51,6 +52,10 @@ class BagSource:
             raise RecordingError(
                 f"{path}: is a ROS 1 bag; convert it with: rosbags-convert --src {path} --dst FOLDER"
             )
+        try:
+            check_bag(path)
+        except OSError as error:
+            raise RecordingError(f"{path}: cannot be read ({error.strerror})") from None
         self._reader = self._open()
 
     def _open(self) -> Any:

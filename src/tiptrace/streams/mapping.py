@@ -12,13 +12,13 @@ from tiptrace.errors import ConfigError
 from tiptrace.streams.sample_reader import TrialTopics
 from tiptrace.types import SIDES, Image, Side
 
-_Positive = Annotated[int, Field(gt=0)]
-_NotNegative = Annotated[int, Field(ge=0)]
+_Positive = Annotated[int, Field(gt=0, le=20_000)]
+_NotNegative = Annotated[int, Field(ge=0, le=20_000)]
 _FLIP_CODES = {"horizontal": 1, "vertical": 0, "both": -1}
 
 
 class _Model(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class ImageMap(_Model):

@@ -23,12 +23,15 @@ from mcap.records import Attachment, Channel, Chunk, McapRecord, Message, Schema
 from mcap.stream_reader import breakup_chunk
 
 from tiptrace.errors import RecordingError
+from tiptrace.streams.chunks import unpacked
+from tiptrace.streams.definitions import is_own_definition
 from tiptrace.streams.raw_messages import RawMessage
 from tiptrace.streams.topics import NS
 
 T = TypeVar("T")
 MAGIC = b"\x89MCAP0\r\n"
 _MAX_RECORD = 2**31  # bytes: larger lengths are damage, not data
+_MAX_TIME_NS = 2**62  # the year 2116
 _KNOWN = {int(opcode) for opcode in Opcode}
 _PRIVATE = 0x80  # opcodes from here on belong to applications and are skipped
 _LIBRARY_ERRORS: tuple[type[Exception], ...] = (  # what the libraries raise on bytes that are wrong
@@ -145,6 +148,8 @@ class McapSource:
         """By the definition in the file, or where that is none that can be read, by ROS 2's own of that name."""
         from mcap_ros2.decoder import DecoderFactory
 
+        if schema.encoding == "ros2msg" and not is_own_definition(schema.name, schema.data):
+            raise ValueError("the file's definition is not ROS 2's")
         if self._factory is None:
             self._factory = DecoderFactory()
         decoder: Callable[[bytes], Any] | None = self._factory.decoder_for("cdr", schema)
@@ -252,6 +257,8 @@ class McapSource:
         for record in records:
             self._define(record)
             if isinstance(record, Message):
+                if record.log_time > _MAX_TIME_NS:
+                    raise _DamageError(f"a message is dated {record.log_time} ns")
                 if not frame.start_ns <= record.log_time <= frame.end_ns:
                     raise _DamageError("a message lies outside its chunk's time range")
                 found.append(self._resolve(record))
@@ -285,6 +292,6 @@ def _parse(read: Callable[[ReadDataStream], T], body: bytes) -> T:
 
 def _open_chunk(chunk: Chunk) -> list[McapRecord]:
     try:
-        return breakup_chunk(chunk, validate_crc=True)
+        return breakup_chunk(unpacked(chunk), validate_crc=True)
     except _LIBRARY_ERRORS as error:
         raise _DamageError(_reason(error)) from None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
 from typing import Any
 
 import cv2
@@ -11,6 +10,8 @@ import numpy as np
 
 from tiptrace.errors import GeometryError
 from tiptrace.geometry.transforms import quaternion_from_rotation, rotation_from_quaternion, transform
+from tiptrace.streams.definitions import schema_text as schema_text
+from tiptrace.streams.image_bytes import decode_image
 from tiptrace.streams.topics import NS
 from tiptrace.types import FloatArray, Image, Phase
 
@@ -31,16 +32,12 @@ def image_from_compressed(message: Any) -> Image:
     """``CompressedImage`` → (height, width, 3) BGR.
 
     Raises:
-        MessageError: bytes that OpenCV cannot decode.
+        MessageError: no png or jpeg that can be decoded.
     """
-    data = np.frombuffer(message.data, dtype=np.uint8)
-    try:
-        image = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
-    except cv2.error:
-        image = None
+    image = decode_image(message.data)
     if image is None:
-        raise MessageError(f"the {message.format or 'compressed'} data cannot be decoded")
-    return np.asarray(image, dtype=np.uint8)
+        raise MessageError(f"the {message.format or 'compressed'} data cannot be decoded as png or jpeg")
+    return image
 
 
 _CONVERSIONS: dict[str, tuple[int, int | None]] = {  # encoding → channels, conversion to BGR
@@ -177,14 +174,6 @@ TRUTH_READERS: dict[str, Callable[[Any], FloatArray]] = {
 
 
 # --- values to messages ------------------------------------------------------------------------------------
-
-
-@cache
-def schema_text(message_type: str) -> str:
-    """Definition of a ROS 2 type with all it contains, as MCAP's ``ros2msg`` encoding wants it."""
-    from rosbags.typesys import Stores, get_typestore
-
-    return get_typestore(Stores.ROS2_JAZZY).generate_msgdef(message_type, ros_version=2)[0]
 
 
 def header_message(stamp_ns: int, frame_id: str) -> dict[str, Any]:

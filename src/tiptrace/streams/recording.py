@@ -6,12 +6,9 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-import cv2
-import numpy as np
-import yaml
-
-from tiptrace.config import Rig, Tool, parse_yaml
-from tiptrace.errors import RecordingError
+from tiptrace.config import Rig, Tool, parse_yaml, read_yaml
+from tiptrace.errors import ConfigError, RecordingError
+from tiptrace.streams.image_bytes import decode_image
 from tiptrace.streams.mcap_source import McapSource
 from tiptrace.streams.sample_reader import TrialTopics
 from tiptrace.streams.survey import TopicSurvey
@@ -108,8 +105,8 @@ class Recording:
         """``trial.yaml``: free metadata, for reports only."""
         data = self._source.attachments.get(TRIAL_FILE)
         try:
-            content = yaml.safe_load(data) if data is not None else {}
-        except (yaml.YAMLError, UnicodeDecodeError):
+            content = read_yaml(data, TRIAL_FILE) if data is not None else {}
+        except ConfigError:
             content = None
         return content if isinstance(content, dict) else {}
 
@@ -160,13 +157,10 @@ def decode_reference(data: bytes, where: str) -> Image:
     Raises:
         RecordingError: not an image.
     """
-    try:
-        image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_COLOR) if data else None
-    except cv2.error:
-        image = None
+    image = decode_image(data)
     if image is None:
         raise RecordingError(f"{where}: is not an image that can be decoded; give a png or jpeg file")
-    return np.asarray(image, dtype=np.uint8)
+    return image
 
 
 def check_reference(image: Image, rig: Rig, side: Side, where: str) -> None:
