@@ -3,18 +3,25 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from tiptrace.calibration.gel_circles import PressSamples, contact_samples, find_circles, in_one_place
-from tiptrace.calibration.gel_data import Circle, PressFolder, read_press_folder
+from tiptrace.calibration.gel_circles import (
+    PressSamples,
+    contact_samples,
+    find_circles,
+    in_one_place,
+    locate,
+)
+from tiptrace.calibration.gel_data import Circle, PressFolder, check_rig, read_press_folder
 from tiptrace.calibration.gel_evaluation import PressScore, measured_slopes, score_press
 from tiptrace.calibration.gel_network import HIDDEN, Progress, train_network
 from tiptrace.calibration.gel_onnx import mlp_to_onnx
 from tiptrace.calibration.gel_pictures import draw_press
 from tiptrace.calibration.gel_shading import Shading, fit_shading
+from tiptrace.config import Sensor
 from tiptrace.perception.gel_model import Convention, GelModel
 from tiptrace.types import FloatArray
 
@@ -38,8 +45,9 @@ class GelTrainingReport:
         mm_per_px: Scale used.
         scale_is_assumed: True if nobody gave the scale.
         marker_pitch_mm: What the scale makes of the markers' pitch; None without dots.
-        valid_px: (u_min, v_min, u_max, v_max) that the contacts cover.
-        one_place: True if the presses cover too little of the gel to teach its dependence on place.
+        valid_px: (u_min, v_min, u_max, v_max) that the contacts of the training presses cover.
+        one_place: True if the presses cover too little of the gel to teach its dependence on place; the model
+            is then valid in ``valid_px`` only.
         circles: Contact of each press, found or refined.
         seconds: Time taken.
     """
@@ -67,6 +75,7 @@ def train_gel(
     *,
     seed: int = 0,
     mm_per_px: tuple[float, float] | None = None,
+    sensor: Sensor | None = None,
     pictures: Path | None = None,
     progress: Progress | None = None,
 ) -> GelTrainingReport:
@@ -76,34 +85,42 @@ def train_gel(
         folder: Holds ``reference.png``, ``presses.csv`` and the images (see :func:`read_press_folder`).
         out: ONNX file to write.
         seed: Decides held-out presses, samples and initial weights.
-        mm_per_px: Scale (x, y) of the images; None: the csv's, else 20 mm over the image's width.
+        mm_per_px: Scale (x, y) of the images; None: the sensor's, else the csv's, else 20 mm over the width.
+        sensor: What the rig says of it: size and scale of the images, pitch of the markers.
         pictures: Folder for a picture of each held-out press; None: none are drawn.
         progress: Called with a label and the share done.
 
     Raises:
-        CalibrationError: a folder that does not determine the gel.
+        CalibrationError: a folder that does not determine the gel, or a gel that is not the rig's.
         MissingExtraError: scikit-learn or onnx is not installed.
     """
     start = time.perf_counter()
     tell = progress or (lambda _label, _share: None)
+    if mm_per_px is None and sensor is not None:
+        mm_per_px = sensor.mm_per_px
     data = read_press_folder(folder, mm_per_px)
+    if sensor is not None:
+        check_rig(data, sensor)
     tell("finding the contacts", 0.0)
-    circles = find_circles(data)
-    one_place = in_one_place(circles, data)
     rng = np.random.default_rng(seed)
-    test = set(rng.permutation(len(circles))[: max(len(circles) // _HELD_OUT, 1)].tolist())
-    train = [i for i in range(len(circles)) if i not in test]
-    shading = shading_of(data, circles, train, one_place=one_place)
+    shuffled = rng.permutation(len(data.presses)).tolist()
+    n_test = max(len(data.presses) // _HELD_OUT, 1)
+    test, train = sorted(shuffled[:n_test]), sorted(shuffled[n_test:])
+    training = replace(data, presses=tuple(data.presses[i] for i in train))
+    found = find_circles(training)
+    one_place = in_one_place(found, data)
+    shading = shading_of(training, found, one_place=one_place)
+    held_out = [locate(data.presses[i], data, shading) for i in test]
     convention = Convention(background="ratio", coordinates="zero" if one_place else "unit")
     network = train_network(shading, data.background, pixel_noise(data), convention, rng, tell)
-    valid = _coverage(circles)
-    metadata = _metadata(data, valid, shading)
+    valid = _coverage(found)
+    metadata = _metadata(data, valid, shading) | {"one_place": "yes" if one_place else "no"}
     out.write_bytes(mlp_to_onnx(network.weights, network.biases, convention, metadata=metadata))
     gel = GelModel(out.read_bytes(), str(out))
-    scores = tuple(score_press(gel, data.presses[i], circles[i], data) for i in sorted(test))
+    scores = tuple(score_press(gel, data.presses[i], c, data) for i, c in zip(test, held_out, strict=True))
     if pictures is not None:
         pictures.mkdir(parents=True, exist_ok=True)
-        for i, score in zip(sorted(test), scores, strict=True):
+        for i, score in zip(test, scores, strict=True):
             draw_press(score, data.presses[i], data, pictures / f"{Path(score.name).stem}.png")
     flat = measured_slopes(gel, data.reference, data.background, data.presses[0].dots)
     pitch = data.marker_pitch_px
@@ -121,15 +138,15 @@ def train_gel(
         marker_pitch_mm=None if pitch is None else pitch * float(np.mean(data.mm_per_px)),
         valid_px=valid,
         one_place=one_place,
-        circles={p.name: c for p, c in zip(data.presses, circles, strict=True)},
+        circles={data.presses[i].name: c for i, c in zip(train + test, found + held_out, strict=True)},
         seconds=time.perf_counter() - start,
     )
 
 
-def shading_of(data: PressFolder, circles: list[Circle], which: list[int], *, one_place: bool) -> Shading:
-    """Shading model from some of the presses."""
-    most = max(_PIXELS // len(which), 200)
-    parts = [contact_samples(data.presses[i], circles[i], data, most=most) for i in which]
+def shading_of(data: PressFolder, circles: list[Circle], *, one_place: bool) -> Shading:
+    """Shading model from all presses of a folder."""
+    most = max(_PIXELS // len(circles), 200)
+    parts = [contact_samples(p, c, data, most=most) for p, c in zip(data.presses, circles, strict=True)]
     stacked = [np.concatenate([getattr(p, name) for p in parts]) for name in PressSamples.__slots__]
     return fit_shading(*stacked, place_degree=0 if one_place else 1)
 

@@ -23,6 +23,7 @@ _ONE_PLACE = 0.25  # of the width and height of the image
 _FIT_PIXELS = 600  # of each press while circles are sought
 _MISFIT = 2.5  # residual, in units of the usual one, at which the contact ends
 _GROWTH = 0.97  # the contact ends where the colour changes most, a little blurred
+_MOST = 0.97  # of the largest change: on steep contacts colour is saturated beyond, and a circle further out too wide
 _NOT_STEEPER = 0.94  # sine of the steepest slope taken from a ball
 
 
@@ -43,10 +44,7 @@ def find_circles(folder: PressFolder) -> list[Circle]:
         CalibrationError: a press that changes the image too little to be found.
     """
     circles = [_from_colour_change(press, folder) for press in folder.presses]
-    limits = [
-        min(_NOT_STEEPER * ball_radius_px(press, folder), _GROWTH * circle.radius)
-        for press, circle in zip(folder.presses, circles, strict=True)
-    ]
+    limits = [_limit(p, c, folder) for p, c in zip(folder.presses, circles, strict=True)]
     place_degree = 0 if in_one_place(circles, folder) else 1
     shading = _fit(folder, circles, 0.8, place_degree)
     for _ in range(_ROUNDS):
@@ -56,6 +54,19 @@ def find_circles(folder: PressFolder) -> list[Circle]:
         ]
         shading = _fit(folder, circles, 0.95, place_degree)
     return circles
+
+
+def locate(press: Press, folder: PressFolder, shading: Shading) -> Circle:
+    """Contact circle of a press that had no part in the shading model, so that it can be held out.
+
+    Raises:
+        CalibrationError: a press that changes the image too little to be found.
+    """
+    circle = _from_colour_change(press, folder)
+    limit = _limit(press, circle, folder)
+    for _ in range(_ROUNDS):
+        circle = _refine(press, circle, shading, folder, limit)
+    return circle
 
 
 def in_one_place(circles: list[Circle], folder: PressFolder) -> bool:
@@ -105,8 +116,8 @@ def _fit(folder: PressFolder, circles: list[Circle], share: float, place_degree:
 
 
 def _from_colour_change(press: Press, folder: PressFolder) -> Circle:
-    """First guess. Flat gel in the middle of the blob of changed colour: the centre; where the colour changes
-    most, gel is steepest: the contact's edge."""
+    """First guess. Flat gel in the middle of the blob of changed colour: the centre; where the colour has changed
+    as much as it ever does, gel is steepest: the contact's edge."""
     change = smooth_fill(press.image.astype(np.float32) - folder.background, press.dots)
     scale = folder.reference.shape[1] / 320.0
     size = np.linalg.norm(cv2.GaussianBlur(change, (0, 0), 1.5 * scale), axis=2)
@@ -125,12 +136,21 @@ def _from_colour_change(press: Press, folder: PressFolder) -> Circle:
 
 
 def _steepest(size: FloatArray, cu: float, cv: float, limit: float) -> float:
-    """Radius (px) around a centre at which the mean colour change is largest."""
+    """Radius (px) around a centre at which the mean colour change reaches nearly its largest value."""
     v, u = np.indices(size.shape)
     ring = np.hypot(u - cu, v - cv).astype(np.intp)
     near = ring < max(limit, 4)
     profile = np.bincount(ring[near], weights=size[near]) / np.maximum(np.bincount(ring[near]), 1)
-    return float(np.argmax(profile)) + 0.5
+    level = _MOST * float(profile.max())
+    k = int(np.argmax(profile >= level))
+    if k == 0:
+        return 0.5
+    return k + 0.5 - float((profile[k] - level) / (profile[k] - profile[k - 1]))
+
+
+def _limit(press: Press, circle: Circle, folder: PressFolder) -> float:
+    """Largest radius (px) that a contact may get: the ball's own, or where the first guess ended."""
+    return min(_NOT_STEEPER * ball_radius_px(press, folder), _GROWTH * circle.radius)
 
 
 def _refine(press: Press, circle: Circle, shading: Shading, folder: PressFolder, limit: float) -> Circle:

@@ -10,9 +10,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tiptrace.config import Sensor
 from tiptrace.errors import CalibrationError, PerceptionError
 from tiptrace.perception.background import check_untouched, has_dots, untouched_background
-from tiptrace.perception.markers import check_image, detect_markers, dot_mask
+from tiptrace.perception.markers import check_image, check_pitch, detect_markers, dot_mask
 from tiptrace.types import BoolArray, Image
 
 MIN_PRESSES = 6
@@ -110,6 +111,20 @@ def read_press_folder(folder: Path, mm_per_px: tuple[float, float] | None = None
         scale_is_assumed=given is None,
         marker_pitch_px=_pitch(reference) if dotted else None,
     )
+
+
+def check_rig(folder: PressFolder, sensor: Sensor) -> None:
+    """Refuse presses of another gel, or another crop, than the rig says.
+
+    Raises:
+        CalibrationError: other image size, or another pitch of the markers.
+    """
+    try:
+        check_image(folder.reference, sensor.image_size_px)
+        if folder.marker_pitch_px is not None:
+            check_pitch(detect_markers(folder.reference), sensor.marker_pitch_mm, folder.mm_per_px)
+    except PerceptionError as error:
+        raise CalibrationError(f"reference.png: {error}") from None
 
 
 def _pitch(reference: Image) -> float:
