@@ -59,6 +59,7 @@ class Sensing:
         self._both = both
         self.fingers: dict[Side, Finger] = {}
         self._loaded: dict[str, GelModel] = {}
+        self._sensor_poses: dict[Side, tuple[float | None, FloatArray]] = {}
         if stream.references:  # images will come: the first one should not wait
             warm_up()
 
@@ -78,7 +79,7 @@ class Sensing:
         else:
             x_S = seen.sample.x_S
             markers = FingerMarkers(x_S=x_S, tracked=~(x_S != x_S).any(axis=1))
-        return SensedFinger(markers, seen.T_B_E, self._rig.T_E_S(side, observation.opening_m))
+        return SensedFinger(markers, seen.T_B_E, self._T_E_S(side, observation.opening_m))
 
     def _finger(self, side: Side) -> Finger:
         if side not in self.fingers:
@@ -88,6 +89,13 @@ class Sensing:
                 gel = self._gel(sensor.gel_model)
             self.fingers[side] = Finger(sensor, gel, self._references.get(side), self._config, side=side)
         return self.fingers[side]
+
+    def _T_E_S(self, side: Side, opening_m: float | None) -> FloatArray:
+        """Sensor pose (4, 4) in F_E; it changes with the opening only."""
+        known = self._sensor_poses.get(side)
+        if known is None or known[0] != opening_m:
+            known = self._sensor_poses[side] = (opening_m, self._rig.T_E_S(side, opening_m))
+        return known[1]
 
     def _gel(self, name: str) -> GelModel:
         """A gel model by the rig's name for it; two gels of one model share it."""

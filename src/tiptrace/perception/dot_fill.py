@@ -28,17 +28,20 @@ class DotFill:
         """For discs of a radius in map pixels."""
         self._radius = radius_px
         angle = 2.0 * np.pi * np.arange(_RING_POINTS) / _RING_POINTS
-        self._ring = (radius_px + _OUTSIDE_PX) * np.stack([np.cos(angle), np.sin(angle)], axis=1)  # (m, 2)
+        self._double = np.stack([np.cos(angle), np.sin(angle)], axis=1)  # (m, 2)
+        self._ring = (radius_px + _OUTSIDE_PX) * self._double  # (m, 2)
 
     def apply(self, planes: Float32Map, uv: FloatArray) -> None:
         """Overwrite discs at places (n, 2), map px, in smoothly filled maps (c, H, W)."""
-        directions, sure = _directions(planes, uv, self._ring)
+        directions, sure = _directions(planes, uv, self._ring, self._double)
         _borrow_from_nearest(directions, sure, uv)
         _fill_discs(planes, uv, directions, self._radius)
 
 
 @compiled
-def _directions(planes: Float32Map, uv: FloatArray, ring: FloatArray) -> tuple[FloatArray, BoolArray]:
+def _directions(
+    planes: Float32Map, uv: FloatArray, ring: FloatArray, double: FloatArray
+) -> tuple[FloatArray, BoolArray]:
     """Unit direction (n, 2) of least change across each dot, NaN where nothing changes; is it seen all round (n,)?"""
     n, m, C = len(uv), len(ring), planes.shape[0]
     directions, sure = np.full((n, 2), np.nan), np.zeros(n, dtype=np.bool_)
@@ -56,7 +59,7 @@ def _directions(planes: Float32Map, uv: FloatArray, ring: FloatArray) -> tuple[F
             for c in range(C):
                 values[c, k::m] = _sample(planes[c], u, v)
         _disagreement(values, seen, cost)
-        _add_steps_at_touch(values, seen, cost)
+        _add_steps_at_touch(values, seen, double, cost)
         theta = _lowest(cost)
         directions[i, 0], directions[i, 1] = np.cos(theta), np.sin(theta)
     return directions, sure
@@ -85,26 +88,29 @@ def _disagreement(values: Float32Map, seen: Float32Map, cost: FloatArray) -> Non
     at points k and k' with k + k' = d + m/2; among them are two single points where that is even.
     """
     m = len(cost)
+    back, back_seen = values[:, ::-1].copy(), seen[::-1].copy()
     for d in range(m):
         odd = (d + m // 2) % 2
         middle = (d + m // 2) // 2 + m
+        chords, ahead, behind = m // 2 - 1 + odd, middle + 1, 3 * m - middle - odd
+        w, w_back = seen[ahead : ahead + chords], back_seen[behind : behind + chords]
         squares, count = np.float32(0.0), np.float32(0.0)
         for c in range(values.shape[0]):
-            for j in range(1 - odd, m // 2):
-                difference = values[c, middle - j] - values[c, middle + odd + j]
-                squares += seen[middle - j] * seen[middle + odd + j] * difference * difference
-        for j in range(1 - odd, m // 2):
-            count += seen[middle - j] * seen[middle + odd + j]
+            x, y = values[c, ahead : ahead + chords], back[c, behind : behind + chords]
+            for j in range(chords):
+                squares += w[j] * w_back[j] * (x[j] - y[j]) * (x[j] - y[j])
+        for j in range(chords):
+            count += w[j] * w_back[j]
         points = 2.0 * count + (1 - odd) * (seen[middle] + seen[middle + m // 2])
         cost[d] = 2.0 * squares / points if points > _LEAST_ENDS else np.inf
 
 
 @compiled
-def _add_steps_at_touch(values: Float32Map, seen: Float32Map, cost: FloatArray) -> None:
+def _add_steps_at_touch(values: Float32Map, seen: Float32Map, double: FloatArray, cost: FloatArray) -> None:
     """Add the mean square step along the ring where chords at each angle touch it.
 
     A ridge through the dot's middle looks the same from both sides and from both ends; chords along it touch the ring
-    where the values do not change.
+    where the values do not change. ``double`` (m, 2): cosine and sine of twice the angles π k/m of the chords.
     """
     m = len(cost)
     total, total_cos, total_sin = 0.0, 0.0, 0.0
@@ -112,13 +118,12 @@ def _add_steps_at_touch(values: Float32Map, seen: Float32Map, cost: FloatArray) 
         square = 0.0
         for c in range(values.shape[0]):
             square += seen[k] * seen[k + 1] * (values[c, k + 1] - values[c, k]) ** 2
-        angle = 4.0 * np.pi * (k + 0.5) / m
         total += square
-        total_cos += square * np.cos(angle)
-        total_sin += square * np.sin(angle)
+        at = (2 * k + 1) % m  # the step lies at the angle 2 π (k + ½)/m
+        total_cos += square * double[at, 0]
+        total_sin += square * double[at, 1]
     for d in range(m):
-        angle = 2.0 * np.pi * d / m
-        cost[d] += 0.5 / m * (total - total_cos * np.cos(angle) - total_sin * np.sin(angle))
+        cost[d] += 0.5 / m * (total - total_cos * double[d, 0] - total_sin * double[d, 1])
 
 
 @compiled

@@ -24,9 +24,10 @@ from tiptrace.types import BoolArray, FloatArray, Image
 
 Float32Map = NDArray[np.float32]
 
-_RING = np.stack([np.cos(np.arange(8) * np.pi / 4), np.sin(np.arange(8) * np.pi / 4)], axis=1)  # (8, 2)
+_RING_POINTS = 8
 _VISIBLE = 0.1  # of the image that must be untouched to level a map by it
 _CALM = 0.02  # slope below which gel may tell about the lamps
+_CALM_AROUND_PX = 8.0  # on the mean over so many pixels each way
 _FIRST_ROUNDS = 6
 _LEANS = 0.06  # slope below which gel, pressed in or not, may tell about a gain common to the lamps
 _NOISE_M = 12e-6  # of a marker's depth, wherever it lies
@@ -63,6 +64,7 @@ class FullDepth:
         self._flat = self._network(
             np.ones_like(self._background), np.ones(3)
         )  # what the network says of untouched gel
+        self._box = 2 * round(_CALM_AROUND_PX / (2 * step)) + 1  # map px
         self._calm: BoolArray | None = None
         self._lean_little = np.ones(shape, dtype=np.bool_)
         self._slopes: Float32Map = np.zeros((2, *shape), dtype=np.float32)
@@ -102,11 +104,10 @@ class FullDepth:
         h = self._solver.integrate(slopes[0], slopes[1])
         np.negative(h, out=h)
         untouched, _ = untouched_of(h, slopes)
-        visible = float(untouched.mean()) > _VISIBLE
+        visible = cv2.countNonZero(untouched.view(np.uint8)) > _VISIBLE * untouched.size
         h = self._level.apply(h, untouched if visible else None)
-        steepness = cv2.blur(np.abs(slopes).max(axis=0), (5, 5))
-        self._calm = untouched & (steepness < _CALM) & visible
-        self._lean_little = np.asarray(steepness < _LEANS)
+        steepness = np.asarray(cv2.blur(_steeper(slopes), (self._box, self._box)), dtype=np.float32)
+        self._calm, self._lean_little = _calm_gel(steepness, untouched, visible)
         return DepthMap(depth_m=h, untouched=untouched, zero_visible=visible)
 
     def expect_dots(self, radius_px: float) -> None:
@@ -122,10 +123,9 @@ class FullDepth:
 
         The fill's error grows with how much the slope varies around the dot.
         """
-        ring = radius_px + self.step
-        around = (uv_px[:, None] + ring * _RING[None]).reshape(-1, 2)  # (8 n, 2)
-        samples = [sample_map(s, around, self.step).reshape(-1, len(_RING)) for s in self._slopes]
-        variation = np.sqrt(sum(np.var(s, axis=1) for s in samples))  # (n,) m/m
+        variation = _variation(
+            self._slopes, (uv_px - (self.step - 1) / 2) / self.step, radius_px / self.step + 1.0
+        )
         fill = _FILL_SHARE * variation * radius_px * self._s
         return np.asarray(np.sqrt(_NOISE_M**2 + (_DEPTH_SHARE * depth_m) ** 2 + fill**2))
 
@@ -180,3 +180,48 @@ def _change_beside(slopes: Float32Map, flat: Float32Map, mask: BoolArray) -> tup
                 change[0, v, u] = slopes[v, u, 0] - flat[v, u, 0]
                 change[1, v, u] = slopes[v, u, 1] - flat[v, u, 1]
     return change, weight
+
+
+@compiled
+def _steeper(slopes: Float32Map) -> Float32Map:
+    """The larger of the two slopes' magnitudes, (h, w)."""
+    _, h, w = slopes.shape
+    steepness = np.empty((h, w), dtype=np.float32)
+    for v in range(h):
+        for u in range(w):
+            steepness[v, u] = max(abs(slopes[0, v, u]), abs(slopes[1, v, u]))
+    return steepness
+
+
+@compiled
+def _calm_gel(steepness: Float32Map, untouched: BoolArray, visible: bool) -> tuple[BoolArray, BoolArray]:
+    """Gel (h, w) that may tell about the lamps: untouched and flat; leaning little, pressed in or not."""
+    h, w = steepness.shape
+    calm, lean = np.empty((h, w), dtype=np.bool_), np.empty((h, w), dtype=np.bool_)
+    for v in range(h):
+        for u in range(w):
+            calm[v, u] = visible and untouched[v, u] and steepness[v, u] < _CALM
+            lean[v, u] = steepness[v, u] < _LEANS
+    return calm, lean
+
+
+@compiled
+def _variation(slopes: Float32Map, uv: FloatArray, radius: float) -> FloatArray:
+    """Standard deviation (n,) of slopes (2, h, w) around places (n, 2), on rings of a radius; map pixels."""
+    _, h, w = slopes.shape
+    variation = np.full(len(uv), np.nan)
+    for i in range(len(uv)):
+        if np.isnan(uv[i, 0] + uv[i, 1]):
+            continue
+        variance = 0.0
+        for c in range(2):
+            total, squares = 0.0, 0.0
+            for k in range(_RING_POINTS):
+                angle = 2.0 * np.pi * k / _RING_POINTS
+                u = min(max(round(uv[i, 0] + radius * np.cos(angle)), 0), w - 1)
+                v = min(max(round(uv[i, 1] + radius * np.sin(angle)), 0), h - 1)
+                total += slopes[c, v, u]
+                squares += slopes[c, v, u] ** 2
+            variance += max(squares / _RING_POINTS - (total / _RING_POINTS) ** 2, 0.0)
+        variation[i] = np.sqrt(variance)
+    return variation

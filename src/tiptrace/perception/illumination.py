@@ -66,7 +66,7 @@ class LampGain:
             means_0, good_0 = self._first
             both = good & good_0
             if int(both.sum()) >= _LEAST_BLOCKS:
-                self.gain = self._gain_0 * np.median(means[both] / means_0[both], axis=0)
+                self.gain = self._gain_0 * _median_ratio(means, means_0, both)
             else:
                 self._from_flat(ratio, flat)
         return self.gain
@@ -125,6 +125,20 @@ def _block_means(ratio: Float32Map, use: BoolArray, columns: int, rows: int) -> 
         for c in range(3):
             means[b, c] = total[b, c] / max(used[b], 1.0)
     return means, used > _LEAST_SHARE * all_of
+
+
+@compiled
+def _median_ratio(means: FloatArray, means_0: FloatArray, use: BoolArray) -> FloatArray:
+    """Median (3,) over the used blocks of the means (b, 3) against others."""
+    values, median = np.empty(len(use)), np.empty(3)
+    for c in range(3):
+        n = 0
+        for b in range(len(use)):
+            if use[b]:
+                values[n] = means[b, c] / means_0[b, c]
+                n += 1
+        median[c] = np.median(values[:n])
+    return median
 
 
 class Level:

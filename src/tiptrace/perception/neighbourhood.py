@@ -11,6 +11,8 @@ from tiptrace.types import BoolArray, FloatArray
 _NEIGHBOURS = 8
 _DAMPING = 0.4  # of the affine part, in neighbours: few or one-sided neighbours predict their mean
 _SWEEPS = 30
+_ROUNDS = 3  # of dropping the displacements furthest off …
+_AMONG_WORST = 0.7  # … by at least so much of the worst
 _SETTLED_PX = 0.02  # change of a sweep below which no further one is made
 
 
@@ -43,6 +45,17 @@ class Neighbourhood:
         Unknown ones take part with what their own neighbours predict for them.
         """
         return _predict(self._P, self.neighbours, np.ascontiguousarray(displacement_px), known)
+
+    def drop_strays(self, displacement_px: FloatArray, known: BoolArray, limit_px: float) -> BoolArray:
+        """Those of the known displacements (n, 2) that their neighbours, all at once, do not speak against."""
+        predicted, enough = self.predict(displacement_px, known)
+        return _within(displacement_px, predicted, enough, known, limit_px)
+
+    def agreeing(
+        self, displacement_px: FloatArray, known: BoolArray, limit_px: float
+    ) -> tuple[BoolArray, FloatArray]:
+        """Known displacements (n, 2) less those off their neighbours', worst first, and how far each is off (n,)."""
+        return _agreeing(self._P, self.neighbours, np.ascontiguousarray(displacement_px), known, limit_px)
 
 
 @compiled
@@ -87,3 +100,35 @@ def _from_neighbours(P: FloatArray, neighbours: NDArray[np.intp], x: FloatArray)
             predicted[i, 0] += P[i, k] * x[j, 0]
             predicted[i, 1] += P[i, k] * x[j, 1]
     return predicted
+
+
+@compiled
+def _within(
+    displacement: FloatArray, predicted: FloatArray, enough: BoolArray, known: BoolArray, limit: float
+) -> BoolArray:
+    """Known ones (n,) that lie within a limit of their prediction, where there is one."""
+    kept = known.copy()
+    for i in range(len(known)):
+        off = np.hypot(displacement[i, 0] - predicted[i, 0], displacement[i, 1] - predicted[i, 1])
+        kept[i] &= off < limit or not enough[i]
+    return kept
+
+
+@compiled
+def _agreeing(
+    P: FloatArray, neighbours: NDArray[np.intp], displacement: FloatArray, known: BoolArray, limit: float
+) -> tuple[BoolArray, FloatArray]:
+    kept, off = known.copy(), np.zeros(len(known))
+    for _ in range(_ROUNDS):
+        predicted, enough = _predict(P, neighbours, displacement, kept)
+        worst = 0.0
+        for i in range(len(kept)):
+            off[i] = np.hypot(displacement[i, 0] - predicted[i, 0], displacement[i, 1] - predicted[i, 1])
+            if kept[i] and enough[i] and off[i] > limit:
+                worst = max(worst, off[i])
+        if worst == 0.0:
+            break
+        for i in range(len(kept)):
+            if enough[i] and off[i] > limit and off[i] >= _AMONG_WORST * worst:
+                kept[i] = False
+    return kept, off

@@ -27,6 +27,7 @@ _INK = 0.45  # of the first frame's contrast
 _OFF_GRID = 0.38  # of the pitch: distance from where the neighbours say
 _SEARCH = 0.45  # of the pitch: how far from its predicted place a lost dot is looked for …
 _FOUND = 0.6  # … and may be found
+_EVERY = slice(None)
 _SEARCH_FRAMES = (
     5  # a dot is looked for in each of the first frames that it is missing from, then in every fifth
 )
@@ -69,7 +70,8 @@ class RegisteredTracker:
         grey = grey_image(image)
         guess, followed = self._follow(grey)
         dots = self._meter.measure(grey, guess)
-        seen = self._is_dot(dots, np.arange(len(guess)), grey.shape) & self._near(dots.uv_px, guess, followed)
+        near = max(2.0, 0.12 * self._around.pitch_px), _SEARCH * self._around.pitch_px
+        seen = self._is_dot(dots, guess, np.where(followed, *near), _EVERY, grey.shape)
         uv, seen = self._search(grey, guess, dots.uv_px, seen)
         seen = self._agree(uv, seen)
         predicted, _ = self._around.predict(uv - self._rest, seen)
@@ -83,41 +85,42 @@ class RegisteredTracker:
         now = self._as_bright_as_before(grey)
         moved, there = lucas_kanade(self._grey, now, start)
         back, again = lucas_kanade(now, self._grey, moved, start, max_level=0)
-        mismatch = np.linalg.norm(back - start, axis=1)
-        followed = there & again & (mismatch < _BACK_PX) & self._tracked
-        if followed.any():
-            common = np.median((moved - start)[followed], axis=0)
-            leap = np.linalg.norm(moved - start - common, axis=1)
-            followed &= leap < _LEAP * self._around.pitch_px
-        predicted, enough = self._around.predict(moved - self._rest, followed)
-        off = np.linalg.norm(moved - self._rest - predicted, axis=1)
-        followed &= ~enough | (off < _OFF_GRID * self._around.pitch_px)
+        followed = _came_back(
+            start, moved, back, there & again & self._tracked, _LEAP * self._around.pitch_px
+        )
+        limit = _OFF_GRID * self._around.pitch_px
+        followed = self._around.drop_strays(moved - self._rest, followed, limit)
         predicted, enough = self._around.predict(moved - self._rest, followed)
         held = np.where(enough[:, None], self._rest + predicted, start)
         return np.where(followed[:, None], moved, held), followed
 
     def _as_bright_as_before(self, grey: Grey) -> Grey:
         """Lucas–Kanade takes a change of brightness for motion: lamps are evened out first."""
-        gain = float(self._grey.mean()) / max(float(grey.mean()), 1.0)
+        gain = cv2.mean(self._grey)[0] / max(cv2.mean(grey)[0], 1.0)
         if abs(gain - 1.0) < _SAME_BRIGHTNESS:
             return grey
         return np.asarray(cv2.convertScaleAbs(grey, alpha=gain), dtype=np.uint8)
 
-    def _is_dot(self, dots: DotMeasurement, which: NDArray[np.intp], shape: tuple[int, ...]) -> BoolArray:
-        """Whether measurements of some markers show a dot: dark, of the right size, not cut by the border."""
-        ratio = dots.area_px / self._area[which]
-        whole = self._whole(dots.uv_px, shape)
-        ok = (dots.ink > _INK * self._ink[which]) & (ratio > _AREA[0]) & (ratio < _AREA[1]) & whole
-        return np.asarray(ok, dtype=np.bool_)
+    def _is_dot(
+        self,
+        dots: DotMeasurement,
+        guess: FloatArray,
+        reach: FloatArray,
+        which: slice | NDArray[np.intp],
+        shape: tuple[int, ...],
+    ) -> BoolArray:
+        """Whether measurements of some markers show their dots.
+
+        A dot is dark, of the right size, not cut by the border, and within a reach (n,) of where it was guessed (n, 2).
+        """
+        ok = _look_alike(
+            dots.uv_px, dots.ink, dots.area_px, self._ink[which], self._area[which], guess, reach
+        )
+        return ok & self._whole(dots.uv_px, shape)
 
     def _whole(self, uv: FloatArray, shape: tuple[int, ...]) -> BoolArray:
         """Whether dots at places (n, 2) lie in the image entirely."""
-        low, high = self._margin, np.array([shape[1] - 1, shape[0] - 1]) - self._margin
-        return np.asarray(((uv >= low) & (uv <= high)).all(axis=1))
-
-    def _near(self, uv: FloatArray, guess: FloatArray, followed: BoolArray) -> BoolArray:
-        limit = np.where(followed, max(2.0, 0.12 * self._around.pitch_px), _SEARCH * self._around.pitch_px)
-        return np.asarray(np.linalg.norm(uv - guess, axis=1) < limit)
+        return _inside_by(uv, self._margin, shape[1], shape[0])
 
     def _search(
         self, grey: Grey, guess: FloatArray, uv: FloatArray, seen: BoolArray
@@ -134,8 +137,8 @@ class RegisteredTracker:
             uv[i] = self._darkest(grey, guess[i])
         found = self._meter.measure(grey, uv[missing])
         uv[missing] = found.uv_px
-        near = np.linalg.norm(found.uv_px - guess[missing], axis=1) < _FOUND * self._around.pitch_px
-        seen[missing] = self._is_dot(found, missing, grey.shape) & near
+        reach = np.full(len(missing), _FOUND * self._around.pitch_px)
+        seen[missing] = self._is_dot(found, guess[missing], reach, missing, grey.shape)
         return uv, seen
 
     def _darkest(self, grey: Grey, guess: FloatArray) -> tuple[int, int]:
@@ -152,15 +155,8 @@ class RegisteredTracker:
 
     def _agree(self, uv: FloatArray, seen: BoolArray) -> BoolArray:
         """Drop markers off their neighbours' displacement, worst first, and two markers on one dot."""
-        seen = seen.copy()
-        for _ in range(3):
-            predicted, enough = self._around.predict(uv - self._rest, seen)
-            off = np.linalg.norm(uv - self._rest - predicted, axis=1)
-            bad = seen & enough & (off > _OFF_GRID * self._around.pitch_px)
-            if not bad.any():
-                break
-            worst = off * bad
-            seen &= ~(bad & (worst >= 0.7 * worst.max()))
+        limit = _OFF_GRID * self._around.pitch_px
+        seen, off = self._around.agreeing(uv - self._rest, seen, limit)
         _part_twins(uv, off, seen, self._margin)
         return seen
 
@@ -173,3 +169,53 @@ def _part_twins(uv: FloatArray, off: FloatArray, seen: BoolArray, margin: float)
         for j in range(i + 1, len(uv)):
             if twice[i] and twice[j] and (uv[i, 0] - uv[j, 0]) ** 2 + (uv[i, 1] - uv[j, 1]) ** 2 < margin**2:
                 seen[i if off[i] > off[j] else j] = False
+
+
+@compiled
+def _came_back(
+    start: FloatArray, moved: FloatArray, back: FloatArray, found: BoolArray, leap: float
+) -> BoolArray:
+    """Those found that come back to where they started, and do not leap away from the others (all (n, 2), (n,))."""
+    n = len(start)
+    ok = np.empty(n, dtype=np.bool_)
+    u, v, count = np.empty(n), np.empty(n), 0
+    for i in range(n):
+        ok[i] = found[i] and np.hypot(back[i, 0] - start[i, 0], back[i, 1] - start[i, 1]) < _BACK_PX
+        if ok[i]:
+            u[count], v[count] = moved[i, 0] - start[i, 0], moved[i, 1] - start[i, 1]
+            count += 1
+    if count == 0:
+        return ok
+    common_u, common_v = np.median(u[:count]), np.median(v[:count])
+    for i in range(n):
+        away = np.hypot(moved[i, 0] - start[i, 0] - common_u, moved[i, 1] - start[i, 1] - common_v)
+        ok[i] &= away < leap
+    return ok
+
+
+@compiled
+def _look_alike(
+    uv: FloatArray,
+    ink: FloatArray,
+    area: FloatArray,
+    ink_0: FloatArray,
+    area_0: FloatArray,
+    guess: FloatArray,
+    reach: FloatArray,
+) -> BoolArray:
+    """Whether dots have ink and area as in the first frame, within reach of where they were guessed (n,)."""
+    ok = np.empty(len(uv), dtype=np.bool_)
+    for i in range(len(uv)):
+        ratio = area[i] / area_0[i]
+        ok[i] = ink[i] > _INK * ink_0[i] and _AREA[0] < ratio < _AREA[1]
+        ok[i] &= np.hypot(uv[i, 0] - guess[i, 0], uv[i, 1] - guess[i, 1]) < reach[i]
+    return ok
+
+
+@compiled
+def _inside_by(uv: FloatArray, margin: float, width: int, height: int) -> BoolArray:
+    """Whether places (n, 2) lie in an image, at least a margin from its outermost pixels."""
+    ok = np.empty(len(uv), dtype=np.bool_)
+    for i in range(len(uv)):
+        ok[i] = margin <= uv[i, 0] <= width - 1 - margin and margin <= uv[i, 1] <= height - 1 - margin
+    return ok
