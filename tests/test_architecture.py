@@ -26,14 +26,18 @@ MAY_IMPORT = {
     | {"estimation", "evaluation", "pipeline", "reconstruction", "sim", "streams", "tracer"},
     "batch_plan": BASE,
     "frames": BASE | {"evaluation", "pipeline"},
+    "grasp_file": BASE | {"estimation", "evaluation"},
+    "using": BASE | {"estimation", "grasp_file", "outputs", "pipeline", "streams", "tracer"},
     "batch": BASE
-    | {"batch_plan", "evaluation", "frames", "outputs", "reconstruction", "streams", "trial_runs"},
-    "export": BASE | {"batch_plan", "frames", "outputs", "pipeline", "streams", "tracer"},
+    | {"batch_plan", "evaluation", "frames", "grasp_file", "outputs", "reconstruction", "streams"}
+    | {"trial_runs", "using"},
+    "export": BASE | {"batch_plan", "frames", "geometry", "outputs", "pipeline", "streams", "tracer"},
     "live": BASE
     | {"geometry", "drivers", "streams", "perception", "estimation", "tracer", "pipeline", "calibration"},
     "trial_plan": BASE | {"evaluation", "sim", "trial_runs"},
     "reconstruction": BASE
-    | {"estimation", "evaluation", "geometry", "outputs", "pipeline", "streams", "tracer"},
+    | {"estimation", "evaluation", "geometry", "outputs", "pipeline", "streams", "tracer"}
+    | {"frames", "grasp_file", "using"},
 }
 
 

@@ -5,7 +5,6 @@
     DIR/
       suite.json        what the batch was set to; other settings are refused
       NAME/             as of one recording (docs/data.md), and
-        frames.csv      when the images of each row were taken
         summary.json    its row of the table; written last: it means that the recording is done
       summary.parquet   a row per recording of all shards that is done (.csv without pyarrow)
 """
@@ -14,7 +13,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,11 +27,13 @@ from tiptrace.evaluation.runner import SuiteRun, TrialRun, TrialTask
 from tiptrace.evaluation.suite_store import SuiteStore
 from tiptrace.evaluation.summary_table import write_table
 from tiptrace.evaluation.traces import TrialTraces
-from tiptrace.frames import FRAMES, FrameWatch, write_frames
+from tiptrace.frames import FRAMES
+from tiptrace.grasp_file import GRASP
 from tiptrace.outputs import CSV, EVENTS, METRICS, TUM
 from tiptrace.reconstruction import reconstruct
 from tiptrace.streams.sources import open_recording
 from tiptrace.trial_runs import described
+from tiptrace.using import Using
 
 SUMMARY = "summary.json"
 _REPORT = "report.html"
@@ -48,17 +49,20 @@ class BatchSettings:
         beside: Further methods for the reports.
         report: Whether each recording gets a ``report.html``.
         options: Further arguments of ``open_recording``, as text.
+        using: What stands in for Stage I or the gel network, and whether to smooth.
     """
 
     method: str = "full"
     beside: tuple[str, ...] = ()
     report: bool = False
     options: Mapping[str, str] | None = None
+    using: Using = field(default_factory=Using)
 
     def claim(self) -> dict[str, str]:
         """What results in the same folder must have in common."""
         common = {"method": self.method, "beside": ",".join(self.beside), "report": str(self.report)}
-        return {"batch": "reconstruct", **common, **(self.options or {}), "tiptrace": tiptrace.__version__}
+        given = {**(self.options or {}), **self.using.as_text()}
+        return {"batch": "reconstruct", **common, **given, "tiptrace": tiptrace.__version__}
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,6 +110,7 @@ def run_batch(
         ConfigError: the folder holds results with other settings.
         OutputError: the folder cannot be written.
     """
+    settings.using.check(settings.method, settings.beside)
     store = BatchStore(out, recordings)
     store.claim(settings.claim())
     tasks = [_task(item, settings, out) for item in share(recordings, shard)]
@@ -130,11 +135,19 @@ def reconstruct_trial(task: TrialTask, methods: Sequence[str]) -> TrialRun:
     """
     source = json.loads(task.source)
     path, folder = Path(source["path"]), Path(source["folder"])
-    for name in (SUMMARY, TUM, CSV, EVENTS, METRICS, _REPORT, FRAMES):  # nothing stale beside a failure
+    for name in (
+        SUMMARY,
+        TUM,
+        CSV,
+        EVENTS,
+        METRICS,
+        _REPORT,
+        FRAMES,
+        GRASP,
+    ):  # nothing stale beside a failure
         (folder / name).unlink(missing_ok=True)
     options: dict[str, Any] = {k: v if k in _PLAIN_OPTIONS else Path(v) for k, v in source["options"].items()}
     stream = open_recording(path, **options)
-    watch = FrameWatch()
     result = reconstruct(
         stream,
         folder,
@@ -143,10 +156,9 @@ def reconstruct_trial(task: TrialTask, methods: Sequence[str]) -> TrialRun:
         report=source["report"],
         title=task.name,
         source=path.name,
-        on_step=watch.show,
         threads=False,
+        using=Using.from_text(source["using"]),
     )
-    write_frames(folder, watch.stamps)
     trajectories = {methods[0]: result.methods[0].trajectory}
     return TrialRun(trajectories, result.truth, task=described(task, stream.trial))
 
@@ -240,5 +252,6 @@ def _task(item: NamedPath, settings: BatchSettings, out: Path) -> TrialTask:
         "report": settings.report,
         "beside": list(settings.beside),
         "options": dict(settings.options or {}),
+        "using": settings.using.as_text(),
     }
     return TrialTask(item.name, json.dumps(source))

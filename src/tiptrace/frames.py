@@ -65,8 +65,7 @@ def read_frames(folder: Path, rows: int) -> Stamps:
         lines = list(csv.reader(io.StringIO(path.read_text(encoding="utf-8"))))
     except FileNotFoundError:
         raise OutputError(
-            f"{path}: missing, as after reconstructing a single recording; export the recording itself, or "
-            "reconstruct with --workers 1"
+            f"{path}: missing; reconstruct the recording again, or export the recording itself"
         ) from None
     except (OSError, UnicodeDecodeError) as error:
         raise OutputError(f"{path}: cannot be read ({error})") from None

@@ -17,7 +17,7 @@ import csv
 import io
 import json
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict
 from decimal import Decimal
 from pathlib import Path
@@ -43,9 +43,22 @@ _UPPER = np.triu_indices(3)  # order of the covariance columns
 
 
 def write_results(
-    folder: Path, trajectory: TipTrajectory, method: str, metrics: TrialMetrics, quality: Quality
+    folder: Path,
+    trajectory: TipTrajectory,
+    method: str,
+    metrics: TrialMetrics,
+    quality: Quality,
+    using: Mapping[str, str] | None = None,
 ) -> None:
     """Write all files of a reconstruction into a folder, which is made where it is missing.
+
+    Args:
+        folder: Where.
+        trajectory: What.
+        method: That made it.
+        metrics: Of it.
+        quality: Of it.
+        using: What stood in for the usual means, as text; smoothed estimates are no longer causal.
 
     Raises:
         OutputError: the folder or a file cannot be written.
@@ -54,6 +67,8 @@ def write_results(
     write_atomic(folder / CSV, csv_text(trajectory.estimates))
     write_atomic(folder / EVENTS, json.dumps([asdict(e) for e in trajectory.events], indent=1) + "\n")
     record = metrics_record(method, trajectory.anchor, metrics, quality)
+    record |= {"estimates": "smoothed" if (using or {}).get("smooth") else "causal"}
+    record |= {"using": dict(using)} if using else {}
     write_atomic(folder / METRICS, json.dumps(record, indent=1, allow_nan=False) + "\n")
 
 

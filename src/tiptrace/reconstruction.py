@@ -5,7 +5,7 @@ from __future__ import annotations
 import platform
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Protocol
@@ -13,16 +13,20 @@ from typing import Any, Protocol
 import numpy as np
 
 import tiptrace
+from tiptrace.estimation.full import FullEstimator
 from tiptrace.estimation.paper import PaperEstimator
+from tiptrace.estimation.smoothing import Recorded, smooth
 from tiptrace.evaluation.metrics import TrialMetrics, evaluate
 from tiptrace.evaluation.quality import Quality, assess
 from tiptrace.evaluation.report_data import AnchoringFit, MethodResult, ReportData, TactileView
 from tiptrace.evaluation.trial_report import write_trial_report
 from tiptrace.evaluation.truth import Truth
+from tiptrace.frames import FrameWatch, write_frames
+from tiptrace.grasp_file import GRASP, write_grasp
 from tiptrace.outputs import write_results
 from tiptrace.pipeline import STEPS, Step, open_tracer, replay, trace
 from tiptrace.streams.sync_report import SyncReport
-from tiptrace.tracer import TipTracer, make_tracer, sensing_of
+from tiptrace.tracer import TipTracer, TracerOptions, make_tracer, sensing_of
 from tiptrace.types import (
     SIDES,
     FloatArray,
@@ -34,6 +38,7 @@ from tiptrace.types import (
     TipTrajectory,
     TruthSample,
 )
+from tiptrace.using import Using
 
 
 class Trial(Stream, Protocol):
@@ -88,6 +93,7 @@ def reconstruct(
     on_pair: Callable[[int], None] | None = None,
     on_step: Callable[[Step], None] | None = None,
     threads: bool = True,
+    using: Using | None = None,
 ) -> Reconstruction:
     """Trace a stream and write the outputs of ``docs/data.md`` into a folder.
 
@@ -103,21 +109,24 @@ def reconstruct(
         on_pair: Called with the number of pairs done.
         on_step: Called with each turn of the loop.
         threads: One thread per finger; without them all runs in the caller's.
+        using: What stands in for Stage I or the gel network, and whether to smooth.
 
     Raises:
         TipTraceError: the recording cannot give a trajectory; the message says why.
     """
+    using = using or Using()
+    using.check(method, tuple(beside))
     samples = stream.truth()
     truth = Truth.from_samples(samples) if samples else None
-    sync, watch = SyncReport(), _Watch(on_pair, bool(beside), report, on_step)
-    with open_tracer(stream, method) if threads else nullcontext(make_tracer(stream, method)) as tracer:
-        watch.tracer = tracer
-        trajectory = trace(stream, tracer, watch, sync)
-    others = (MethodResult(m, _beside(stream, m, method, watch.pairs, truth)) for m in beside)
+    traced = _trace(stream, method, using, threads, _Watch(on_pair, bool(beside), report, on_step))
+    watch, trajectory = traced.watch, traced.trajectory
+    others = (MethodResult(m, _beside(stream, m, method, watch.pairs, truth, using)) for m in beside)
     methods = (MethodResult(method, trajectory), *others)
-    notes = (*stream.notes, *sync.sentences())
+    notes = (*stream.notes, *traced.notes)
     metrics, quality = evaluate(trajectory, truth), _with_notes(assess(trajectory), notes)
-    write_results(out, trajectory, method, metrics, quality)
+    write_results(out, trajectory, method, metrics, quality, using.as_text())
+    write_frames(out, watch.frames.stamps)
+    _keep_grasp(out, traced, stream)
     page = None
     if report:
         data = ReportData(
@@ -129,6 +138,7 @@ def reconstruct(
             step_ms=dict(zip(STEPS, np.asarray(watch.times_ms).T, strict=True)),
             settings={
                 "method": method,
+                **using.as_text(),
                 **{k: str(v) for k, v in stream.trial.items() if not isinstance(v, dict | list)},
             },
             versions=_versions(),
@@ -140,14 +150,83 @@ def reconstruct(
     return Reconstruction(methods, metrics, quality, truth, page, notes)
 
 
+@dataclass(frozen=True, slots=True)
+class _Traced:
+    """A trajectory, who made it, and what the user should know."""
+
+    trajectory: TipTrajectory
+    tracer: TipTracer
+    watch: _Watch
+    notes: tuple[str, ...]
+
+
+def _trace(stream: Trial, method: str, using: Using, threads: bool, watch: _Watch) -> _Traced:
+    """Trace a stream; where there turns out to be no Stage I at all, once more for displacements."""
+    traced = _trace_once(stream, method, using.options(stream), using.smooth, threads, watch)
+    anchored = using.tip or using.anchor_from or using.relative
+    if method != "full" or anchored or watch.marked or _full(traced.tracer).anchoring is not None:
+        return traced
+    options = TracerOptions(depth=using.sensed_depth, use_stage_one=False, relative=True)
+    watch = _Watch(watch.on_pair, watch.keep_pairs, watch.keep_images, watch.on_step)
+    again = _trace_once(stream, method, options, using.smooth, threads, watch)
+    note = (
+        "no phase marks and no anchoring motion: positions are displacements from the first contact; --tip or "
+        "--anchor-from would tell where it is"
+    )
+    return replace(again, notes=(*again.notes, note))
+
+
+def _trace_once(
+    stream: Trial, method: str, options: TracerOptions, smoothed: bool, threads: bool, watch: _Watch
+) -> _Traced:
+    sync = SyncReport()
+    opened = (
+        open_tracer(stream, method, options)
+        if threads
+        else nullcontext(make_tracer(stream, method, options=options))
+    )
+    with opened as tracer:
+        watch.tracer = tracer
+        recorded = None
+        if smoothed and isinstance(tracer.estimator, FullEstimator):
+            recorded = tracer.estimator = Recorded(tracer.estimator)
+        trajectory = trace(stream, tracer, watch, sync)
+    if recorded is not None:
+        trajectory.estimates = smooth(recorded, trajectory.estimates)
+    return _Traced(trajectory, tracer, watch, tuple(sync.sentences()))
+
+
+def _keep_grasp(out: Path, traced: _Traced, stream: Stream) -> None:
+    """What another trial with the same grasp may take over; none where Stage I was not solved."""
+    (out / GRASP).unlink(missing_ok=True)
+    if not isinstance(traced.tracer.estimator, FullEstimator | Recorded):
+        return
+    full = _full(traced.tracer)
+    if full.anchoring is not None and full.anchor is not None and full.anchoring.tip_map.frames > 0:
+        write_grasp(out, full.anchoring, stream.tool)
+
+
+def _full(tracer: TipTracer) -> FullEstimator:
+    estimator = tracer.estimator
+    full = estimator.full if isinstance(estimator, Recorded) else estimator
+    assert isinstance(full, FullEstimator)
+    return full
+
+
 def _beside(
-    stream: Stream, method: str, main: str, pairs: Sequence[SensedPair], truth: Truth | None
+    stream: Stream,
+    method: str,
+    main: str,
+    pairs: Sequence[SensedPair],
+    truth: Truth | None,
+    using: Using,
 ) -> TipTrajectory:
     """A further method: over the markers already sensed where it runs on the same chain."""
     truth_at = None if truth is None else lambda stamp_ns: truth.at([stamp_ns])[0]
+    options = TracerOptions(depth=using.sensed_depth)
     if sensing_of(method) == sensing_of(main):
-        return replay(pairs, make_tracer(stream, method, truth_at=truth_at))
-    with open_tracer(stream, method) as tracer:
+        return replay(pairs, make_tracer(stream, method, truth_at=truth_at, options=options))
+    with open_tracer(stream, method, options) as tracer:
         return trace(stream, tracer)
 
 
@@ -179,6 +258,8 @@ class _Watch:
     tracer: TipTracer | None = None
     times_ms: list[tuple[float, float, float]] = field(default_factory=list)
     pairs: list[SensedPair] = field(default_factory=list)
+    frames: FrameWatch = field(default_factory=FrameWatch)
+    marked: bool = False
     _first: tuple[Step, dict[Side, FloatArray | None]] | None = None
     _last: Step | None = None
     _motions: list[tuple[int, FloatArray, FloatArray]] = field(default_factory=list)
@@ -186,6 +267,8 @@ class _Watch:
     def show(self, step: Step) -> None:
         """Keep what the report needs of a pair."""
         self.times_ms.append(step.times_ms)
+        self.frames.show(step)
+        self.marked |= step.observation.phase is not None
         if self.keep_pairs:
             self.pairs.append(step.sensed)
         if self._first is None and step.estimate.markers:

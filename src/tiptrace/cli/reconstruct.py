@@ -5,9 +5,12 @@ from __future__ import annotations
 import shlex
 import sys
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
+
+if TYPE_CHECKING:
+    from tiptrace.using import Using
 
 
 def reconstruct(
@@ -24,6 +27,25 @@ def reconstruct(
     ] = None,
     rig: Annotated[Path | None, typer.Option(help="rig.yaml, in place of the attached one.")] = None,
     tool: Annotated[Path | None, typer.Option(help="tool.yaml, in place of the attached one.")] = None,
+    smooth: Annotated[
+        bool,
+        typer.Option("--smooth", help="Use the whole trial for every position, not only what came before."),
+    ] = False,
+    tip: Annotated[
+        Path | None, typer.Option(help="No Stage I: the tip (with its σ) of this tool.yaml.")
+    ] = None,
+    anchor_from: Annotated[
+        Path | None,
+        typer.Option(help="No Stage I: results or recording of another trial with the same grasp."),
+    ] = None,
+    regrasp: Annotated[
+        bool, typer.Option("--regrasp", help="The tool was gripped anew since --anchor-from: less certain.")
+    ] = False,
+    regrasp_sigma_mm: Annotated[float, typer.Option(help="By how much less, per axis.")] = 2.0,
+    relative: Annotated[
+        bool, typer.Option("--relative", help="No anchor at all: displacements from the first contact.")
+    ] = False,
+    depth: Annotated[str, typer.Option(help="network, or none: without a calibrated gel.")] = "network",
     map_file: Annotated[
         Path | None, typer.Option("--map", help="map.yaml of another bag; `tiptrace inspect` proposes one.")
     ] = None,
@@ -56,11 +78,21 @@ def reconstruct(
 
       tiptrace reconstruct recordings/ 'more/**/*.mcap' --workers 2 --shard 3/16 --out results
 
+      tiptrace reconstruct trial.mcap --smooth --out smoothed
+
+      tiptrace reconstruct next.mcap --anchor-from results --out next
+
+      tiptrace reconstruct trial.mcap --tip tool.yaml --depth none --out results
+
+    Without marks of the phases the end of Stage I is found from the data.
+
     Many recordings: the results of each go to OUT/NAME, a row of each to OUT/summary.parquet; what is done is not done
     again, what fails is listed and the rest goes on (exit code 1).
     """
     from tiptrace.batch_plan import is_batch
+    from tiptrace.using import Using
 
+    using = Using(tip, anchor_from, regrasp, regrasp_sigma_mm * 1e-3, relative, depth, smooth)
     options: dict[str, Any] = {
         "map_file": map_file,
         "rig": rig,
@@ -71,13 +103,13 @@ def reconstruct(
         "stamps": stamps,
     }
     if workers is None and shard is None and not is_batch(paths):
-        _single(paths[0], out, method, beside or [], report is not False, options)
+        _single(paths[0], out, method, beside or [], report is not False, options, using)
         return
     from tiptrace.batch import BatchSettings
     from tiptrace.cli.reconstruct_batch import reconstruct_batch
 
     given = {key: str(value) for key, value in options.items() if value is not None}
-    settings = BatchSettings(method, tuple(beside or ()), bool(report), given)
+    settings = BatchSettings(method, tuple(beside or ()), bool(report), given, using)
     reconstruct_batch(paths, settings, out, workers, shard)
 
 
@@ -88,6 +120,7 @@ def _single(
     beside: list[str],
     report: bool,
     options: dict[str, Any],
+    using: Using,
 ) -> None:
     from tiptrace.cli.show import print_results, progress_bar
     from tiptrace.reconstruction import reconstruct as run
@@ -106,6 +139,7 @@ def _single(
             command=shlex.join(["tiptrace", *sys.argv[1:]]),
             source=recording.name,
             on_pair=lambda done: progress.update(task, completed=done),
+            using=using,
         )
     print_results(result, f"{recording.name}, method {method}")
     typer.echo(f"results: {out}" + (f"   report: {result.report}" if result.report else ""))

@@ -84,6 +84,7 @@ class FullEstimator:
         if anchor_from is None and not c.use_stage_one and not c.relative:
             self._given = require_tip(tool)
         self._staged = self._given is None and c.use_stage_one
+        self._marked = True
         self._track = PoseTrack(c.pose_memory_s, c.pose_half_width_s)
         self._stage_one = StageOne(c.stage_one, c.patch, c.motion, c.tip_map, c.pose_half_width_s)
         self._running = RunningTip(self._prior, c.tip_noise_m, c.tip_map.map_sigma)
@@ -137,12 +138,16 @@ class FullEstimator:
         poses = pair.poses or (PoseSample(pair.stamp_ns, pair.left.T_B_E),)
         self._track.extend(poses)
         repeated = self._monitor.repeated(markers.x_S, markers.pad)
-        phase = pair.phase or self._phases.update(pair.stamp_ns, pair.left.T_B_E)
+        phase, self._marked = pair.phase or self._found_phase(pair), pair.phase is not None
         if phase is Phase.ANCHORING and self._staged:
             return self._stage_one_step(replace(pair, phase=phase, poses=poses), markers)
         if self._anchoring is None and not self._begin_stage_two(pair, poses, markers):
             return TipEstimate(self._exposure_ns(pair.stamp_ns), phase, Status.LOST)
         return self._stage_two_step(replace(pair, phase=phase, poses=poses), markers, repeated)
+
+    def _found_phase(self, pair: SensedPair) -> Phase:
+        """Where no marks tell it; without a Stage I all is Stage II."""
+        return self._phases.update(pair.stamp_ns, pair.left.T_B_E) if self._staged else Phase.RECONSTRUCTION
 
     # --- Stage I --------------------------------------------------------------------------------------------
 
@@ -165,6 +170,8 @@ class FullEstimator:
         residual = float(motions.residual_m[0])
         estimate = replace(estimate, R_B_E=T_B_E[:3, :3] @ motions.R[0], residual_m=residual)
         solution = self._running.solve()
+        if not (self._marked or self._phases.turned):
+            return estimate  # a hand that only travels is no Stage I
         if solution is None or weak_axes(solution[1], self._config.refuse_sigma_m):
             return estimate
         return replace(estimate, p_B=solution[0], covariance=solution[1])

@@ -32,6 +32,11 @@ class PhaseDetector:
         self._turned = 0.0
         self.end_ns: int | None = None
 
+    @property
+    def turned(self) -> bool:
+        """Whether the hand has turned as in an anchoring motion; before it has, nothing says that the tip rests."""
+        return self._turned >= self._config.turned_before_rad
+
     def update(self, stamp_ns: int, T_B_E: FloatArray) -> Phase:
         """Phase of this frame; ``end_ns`` is set once the end of Stage I is known."""
         if self.end_ns is not None:
@@ -43,7 +48,7 @@ class PhaseDetector:
         while stamp_ns - self._window[0][0] > self._config.window_s * 1e9:
             self._window.popleft()
         start = self._set_off(T_B_E)
-        if start is None or self._turned < self._config.turned_before_rad:
+        if start is None or not self.turned:
             return Phase.ANCHORING
         self.end_ns = start
         return Phase.RECONSTRUCTION

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -14,11 +14,23 @@ import numpy as np
 import tiptrace
 from tiptrace.batch_plan import find_recordings
 from tiptrace.errors import ConfigError, OutputError
+from tiptrace.export.images import EncodedImages
 from tiptrace.frames import FrameWatch, Stamps, read_frames
+from tiptrace.geometry.transforms import quaternion_from_rotation
 from tiptrace.outputs import CSV, METRICS, read_csv
-from tiptrace.pipeline import open_tracer, trace
+from tiptrace.pipeline import Step, open_tracer, trace
 from tiptrace.streams.sources import open_recording
-from tiptrace.types import BoolArray, FloatArray, Phase, Status, TipEstimate
+from tiptrace.types import (
+    SIDES,
+    BoolArray,
+    FloatArray,
+    ImageSample,
+    Phase,
+    Side,
+    Status,
+    Stream,
+    TipEstimate,
+)
 
 ABSOLUTE = (Status.ANCHORING, Status.OK, Status.DEGRADED)
 """States in which a position is one in the base frame; ``relative`` is a displacement."""
@@ -55,6 +67,8 @@ class Episode:
         valid: (n,) whether the position is known, in the base frame.
         status: What each estimate is worth.
         phase: Segment, empty where unknown.
+        state: (n, 7) end effector in the base frame, x y z in m and qx qy qz qw; None from results alone.
+        images: Compressed images of each finger, where they were asked for.
     """
 
     name: str
@@ -65,6 +79,8 @@ class Episode:
     valid: BoolArray
     status: tuple[str, ...]
     phase: tuple[str, ...]
+    state: FloatArray | None = None
+    images: Mapping[Side, EncodedImages] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.status)
@@ -130,7 +146,35 @@ def find_sources(
     return ordered, failures, list(notes)
 
 
-def load_episode(source: Source, method: str, options: Mapping[str, str] | None = None) -> Episode:
+class EpisodeWatch(FrameWatch):
+    """Notes what a dataset keeps of the pairs beside the tip; a viewer of the loop."""
+
+    def __init__(self, images: bool) -> None:
+        """With ``images`` the tactile images are kept, compressed."""
+        super().__init__()
+        self._keep = images
+        self._state: list[FloatArray] = []
+        self.images: dict[Side, EncodedImages] = {}
+
+    def show(self, step: Step) -> None:
+        """Note one pair."""
+        super().show(step)
+        T_B_E = step.observation.left.T_B_E
+        self._state.append(np.concatenate([T_B_E[:3, 3], quaternion_from_rotation(T_B_E[:3, :3])]))
+        for side in SIDES if self._keep else ():
+            sample = step.observation.finger(side).sample
+            if isinstance(sample, ImageSample):
+                self.images.setdefault(side, EncodedImages()).append(sample.image)
+
+    @property
+    def state(self) -> FloatArray:
+        """(n, 7) end effector, m and xyzw."""
+        return np.array(self._state, dtype=np.float64).reshape(-1, 7)
+
+
+def load_episode(
+    source: Source, method: str, options: Mapping[str, str] | None = None, images: bool = False
+) -> Episode:
     """The episode of a source; a recording is traced for it, with ``method``.
 
     Raises:
@@ -139,19 +183,34 @@ def load_episode(source: Source, method: str, options: Mapping[str, str] | None 
     if source.results:
         return _of_results(source)
     given: dict[str, Any] = {k: v if k in _PLAIN_OPTIONS else Path(v) for k, v in (options or {}).items()}
-    stream, watch = open_recording(source.path, **given), FrameWatch()
+    return traced_episode(source.name, open_recording(source.path, **given), method, images)
+
+
+def traced_episode(name: str, stream: Stream, method: str, images: bool = False) -> Episode:
+    """The episode of a stream, traced with ``method``.
+
+    Raises:
+        TipTraceError: it gives no trajectory.
+    """
+    watch = EpisodeWatch(images)
     with open_tracer(stream, method) as tracer:
         trajectory = trace(stream, tracer, watch)
-    return Episode.of(source.name, method, watch.stamps, trajectory.estimates)
+    episode = Episode.of(name, method, watch.stamps, trajectory.estimates)
+    return replace(episode, state=watch.state, images=watch.images)
 
 
 def _of_results(source: Source) -> Episode:
     estimates = read_csv(source.path / CSV)
     metrics = source.path / METRICS
     try:
-        method = str(json.loads(metrics.read_text(encoding="utf-8"))["method"])
+        record = json.loads(metrics.read_text(encoding="utf-8"))
+        method, smoothed = str(record["method"]), record.get("estimates") == "smoothed"
     except (OSError, ValueError, KeyError, TypeError):
         raise OutputError(f"{metrics}: does not tell the method of the trajectory beside it") from None
+    if smoothed:
+        raise OutputError(
+            f"{source.path}: its estimates are smoothed, not causal; reconstruct without --smooth"
+        )
     return Episode.of(source.name, method, read_frames(source.path, len(estimates)), estimates)
 
 
