@@ -13,8 +13,8 @@ def export(
         list[Path],
         typer.Argument(help="Results of `tiptrace reconstruct`, recordings, or folders of either."),
     ],
-    to: Annotated[str, typer.Option(help="parquet or zarr.")] = "parquet",
-    out: Annotated[Path | None, typer.Option(help="File (parquet) or folder (zarr) to write.")] = None,
+    to: Annotated[str, typer.Option(help="parquet, zarr or lerobot.")] = "parquet",
+    out: Annotated[Path | None, typer.Option(help="File (parquet) or folder to write.")] = None,
     method: Annotated[str, typer.Option(help="For recordings; results have theirs.")] = "full",
     map_file: Annotated[
         Path | None, typer.Option("--map", help="map.yaml for other people's recordings.")
@@ -23,6 +23,11 @@ def export(
     reference_frames: Annotated[
         str | None, typer.Option(help="Frames that show the untouched gel, e.g. 0:20.")
     ] = None,
+    lerobot_version: Annotated[str, typer.Option(help="Layout: v3.0 or v2.1.")] = "v3.0",
+    task: Annotated[str | None, typer.Option(help="LeRobot: what was done, in words.")] = None,
+    images: Annotated[
+        bool, typer.Option("--images/--no-images", help="LeRobot: the tactile images too, from recordings.")
+    ] = True,
 ) -> None:
     """Write the tip at every image pair, with covariance and validity, as a dataset for learning.
 
@@ -36,12 +41,14 @@ def export(
       tiptrace reconstruct recordings/ --workers 8 --out results
 
       tiptrace export results --to zarr --out tip.zarr
+
+      tiptrace export recordings/ --to lerobot --lerobot-version v2.1 --task "write" --out tip-lerobot
     """
     from rich.console import Console
 
     from tiptrace.cli.show import progress_bar
     from tiptrace.errors import ConfigError
-    from tiptrace.export.dataset import FORMATS, export_dataset
+    from tiptrace.export.dataset import FORMATS, LeRobotOptions, export_dataset
     from tiptrace.export.episodes import find_sources
     from tiptrace.tracer import METHODS
 
@@ -55,7 +62,8 @@ def export(
     sources, missing, notes = find_sources(paths, bags=map_file is not None)
     with progress_bar() as progress:
         bar = progress.add_task("episodes", total=len(sources))
-        done = export_dataset(sources, to, target, method, options, lambda _: progress.advance(bar))
+        chosen = LeRobotOptions(lerobot_version, task or LeRobotOptions().task, images)
+        done = export_dataset(sources, to, target, method, options, lambda _: progress.advance(bar), chosen)
     console = Console(highlight=False, markup=False, soft_wrap=True)
     for note in notes:
         console.print(f"note: {note}")

@@ -1,0 +1,148 @@
+"""LeRobot datasets: written for both layouts, read back here and, opt in, by the ``lerobot`` package itself."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from tiptrace.errors import ConfigError, OutputError
+from tiptrace.export.dataset import LeRobotOptions, export_dataset
+from tiptrace.export.episodes import Episode, Source, find_sources, load_episode
+from tiptrace.export.images import EncodedImages
+from tiptrace.export.lerobot_format import Feature, pooled, stats_of
+from tiptrace.export.lerobot_writer import LikeTheFirst, write_lerobot
+from tiptrace.sim.spec import make_spec
+from tiptrace.streams.simulated import SimulatedStream
+from tiptrace.streams.writer import write_recording
+from tiptrace.types import Side, Status, TipEstimate
+
+SHORT = {"mode": "markers", "travel_m": 0.011, "fps": 25.0, "anchoring_s": 1.4}
+READER = Path(__file__).with_name("lerobot_read.py")
+
+
+def simulated(folder: Path, count: int) -> Path:
+    for seed in range(count):
+        stream = SimulatedStream(make_spec(seed=seed, trajectory=f"T{seed % 5 + 1}", **SHORT))
+        write_recording(folder / f"t{seed:02d}.mcap", stream, trial=stream.trial_metadata)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return simulated(tmp_path_factory.mktemp("recordings"), 2)
+
+
+def sources_of(folder: Path) -> list[Source]:
+    return find_sources([folder])[0]
+
+
+def made_up(n: int, images: bool = False) -> Episode:
+    stamps = 10**18 + 40_000_000 * np.arange(n)[:, None] + np.array([0, -1, 1])
+    estimates = [TipEstimate(int(s), None, Status.OK, p_B=np.full(3, k)) for k, s in enumerate(stamps[:, 0])]
+    episode = Episode.of("x", "full", stamps, estimates)
+    pictures: dict[Side, EncodedImages] = {}
+    for side in ("left", "right") if images else ():
+        pictures[side] = EncodedImages()
+        for k in range(n):
+            pictures[side].append(np.full((24, 32, 3), (k, 100, 200), dtype=np.uint8))
+    return Episode(**{f: getattr(episode, f) for f in Episode.__slots__} | {"images": pictures})
+
+
+@pytest.mark.parametrize("version", ["v3.0", "v2.1"])
+def test_a_dataset_holds_what_the_tracer_said(recordings: Path, tmp_path: Path, version: str):
+    out = tmp_path / "tip"
+    done = export_dataset(sources_of(recordings), "lerobot", out, lerobot=LeRobotOptions(version))
+    assert not done.failures
+    info = json.loads((out / "meta/info.json").read_text())
+    episodes = [load_episode(s, "full") for s in sources_of(recordings)]
+    assert info["codebase_version"] == version
+    assert (info["total_episodes"], info["total_frames"]) == (2, sum(map(len, episodes)))
+    tables = [pq.read_table(f) for f in sorted((out / "data").rglob("*.parquet"))]
+    rows = [row for table in tables for row in table.to_pylist()]
+    for name, expected in (
+        ("observation.tip.position", np.concatenate([e.position for e in episodes])),
+        ("observation.tip.covariance", np.concatenate([e.covariance.reshape(-1, 9) for e in episodes])),
+        ("observation.state", np.concatenate([e.state for e in episodes if e.state is not None])),
+    ):
+        found = np.array([r[name] for r in rows], dtype=np.float32)
+        np.testing.assert_array_equal(found, expected.astype(np.float32))
+    assert [r["frame.stamp_ns"] for r in rows] == [int(s) for e in episodes for s in e.stamps[:, 0]]
+    assert [r["index"] for r in rows] == list(range(len(rows)))
+    assert json.loads((out / "meta/tiptrace.json").read_text())["estimates"] == "causal"
+
+
+def test_images_go_along_compressed(tmp_path: Path):
+    write_lerobot(tmp_path, [made_up(30, images=True)])
+    (file,) = (tmp_path / "data").rglob("*.parquet")
+    column = pq.read_table(file)["observation.images.tactile_left"].to_pylist()
+    image = cv2.imdecode(np.frombuffer(column[7]["bytes"], np.uint8), cv2.IMREAD_COLOR)
+    assert abs(image.astype(float) - (7, 100, 200)).max() <= 3
+    stats = json.loads((tmp_path / "meta/stats.json").read_text())["observation.images.tactile_left"]
+    assert np.shape(stats["mean"]) == (3, 1, 1)
+    assert np.ravel(stats["mean"]) == pytest.approx([200 / 255, 100 / 255, 10 / 255])
+
+
+def test_statistics_leave_unknown_rows_out_and_add_up():
+    feature = {"x": Feature("float32", (2,))}
+    a, b = np.array([[0.0, 1], [2, 3], [np.nan, np.nan]]), np.array([[4.0, 5]])
+    both = pooled([stats_of(feature, {"x": a}), stats_of(feature, {"x": b})])["x"]
+    known = np.array([[0.0, 1], [2, 3], [4, 5]])
+    assert both["count"] == [3]
+    assert both["mean"] == pytest.approx(known.mean(axis=0))
+    assert both["std"] == pytest.approx(known.std(axis=0))
+    assert (both["min"], both["max"]) == ([0, 1], [4, 5])
+    nothing = stats_of(feature, {"x": a[2:]})["x"]
+    assert nothing["count"] == [0]
+    assert np.isfinite(nothing["mean"]).all()
+
+
+def test_an_episode_unlike_the_first_is_refused():
+    check = LikeTheFirst()
+    check(made_up(5))
+    with pytest.raises(OutputError, match="tactile_left"):
+        check(made_up(5, images=True))
+    with pytest.raises(OutputError, match="fewer than two frames"):
+        check(made_up(1))
+
+
+def test_an_unknown_version_is_refused_before_anything_is_traced(recordings: Path, tmp_path: Path):
+    with pytest.raises(ConfigError, match=r"v3\.0, v2\.1"):
+        export_dataset(sources_of(recordings), "lerobot", tmp_path / "x", lerobot=LeRobotOptions("v1.6"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("version", "variable"), [("v3.0", "TIPTRACE_LEROBOT_V30"), ("v2.1", "TIPTRACE_LEROBOT_V21")]
+)
+def test_the_lerobot_package_reads_20_trials_as_they_were(version: str, variable: str, tmp_path: Path):
+    """Opt in: the variable names a Python interpreter with ``lerobot`` (make test-lerobot)."""
+    python = os.environ.get(variable)
+    if not python:
+        pytest.skip(f"{variable} names no interpreter that has lerobot")
+    folder = tmp_path / "recordings"
+    folder.mkdir()
+    sources = sources_of(simulated(folder, 20))
+    export_dataset(sources, "lerobot", tmp_path / "tip", lerobot=LeRobotOptions(version))
+    command = [python, str(READER), str(tmp_path / "tip"), str(tmp_path / "read.npz")]
+    environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"} | {"HF_HUB_OFFLINE": "1"}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+    about: dict[str, Any] = json.loads((tmp_path / "read.json").read_text())
+    assert (about["version"], about["episodes"], about["fps"]) == (version, 20, 25)
+    read = np.load(tmp_path / "read.npz")
+    episodes = [load_episode(s, "full") for s in sources]
+    for name, parts in (
+        ("observation.tip.position", [e.position for e in episodes]),
+        ("observation.tip.covariance", [e.covariance.reshape(-1, 9) for e in episodes]),
+    ):
+        np.testing.assert_array_equal(read[name], np.concatenate(parts).astype(np.float32))
+    np.testing.assert_array_equal(read["observation.tip.valid"], np.concatenate([e.valid for e in episodes]))
+    np.testing.assert_array_equal(read["frame.stamp_ns"], np.concatenate([e.stamps[:, 0] for e in episodes]))
