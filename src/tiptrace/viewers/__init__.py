@@ -1,0 +1,1 @@
+"""Watching a trial: a page in the browser, and Rerun. Nothing here changes an estimate."""
