@@ -56,3 +56,58 @@ def test_poses_without_rotation_are_refused(tmp_path: Path) -> None:
     still[:, 0, 3] = np.linspace(0, 1, 5)
     with pytest.raises(GeometryError, match="do not rotate"):
         calibrate_tip(read_poses(write(tmp_path / "poses.csv", still)))
+
+
+def spoiled(T: np.ndarray, share: float, seed: int) -> np.ndarray:
+    """A share of the poses off by 10 mm, each in a direction of its own."""
+    rng, out = np.random.default_rng(seed), T.copy()
+    bad = rng.choice(len(T), round(share * len(T)), replace=False)
+    way = rng.normal(size=(len(bad), 3))
+    out[bad, :3, 3] += 10e-3 * way / np.linalg.norm(way, axis=1, keepdims=True)
+    return out
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_real_pointer_poses_with_outliers_stay_within_a_third_of_a_millimetre(
+    shared_data: Path, seed: int
+) -> None:
+    folder = shared_data / "pivot_ndi"
+    T = read_poses(folder / "poses_3x4_rowmajor_m.csv")
+    answer = np.loadtxt(folder / "published_answer_tip_then_pivot_m.csv", delimiter=",").ravel()[:3]
+    bad = spoiled(T, 0.3, seed)
+    robust = calibrate_tip(bad, "maximum-likelihood")
+    assert np.linalg.norm(robust.tip - answer) < 0.3e-3
+    assert robust.outliers >= 25
+    assert np.linalg.norm(calibrate_tip(bad, "least-squares").tip - answer) > np.linalg.norm(
+        robust.tip - answer
+    )
+
+
+def test_both_methods_agree_on_clean_poses_and_know_their_error(poses: np.ndarray) -> None:
+    errors, claims = [], []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        R = rotation_exp(rng.normal(scale=0.3, size=(40, 3)))
+        T = transform(R, np.array([0.4, 0, 0.1]) - R @ np.array([0, 0, 0.2]) + rng.normal(0, 2e-4, (40, 3)))
+        result = calibrate_tip(T)
+        errors.append(result.tip - [0, 0, 0.2])
+        claims.append(result.sigma_m)
+        assert np.linalg.norm(result.tip - calibrate_tip(T, "least-squares").tip) < 3e-4
+    ratio = np.sqrt(np.mean(np.square(errors))) / np.sqrt(np.mean(np.square(claims)))
+    assert 0.6 < ratio < 1.6
+
+
+@pytest.mark.parametrize("method", ["least-squares", "maximum-likelihood"])
+def test_a_single_axis_is_told_in_words(method: str) -> None:
+    R = rotation_exp(np.outer(np.linspace(-0.3, 0.3, 20), [0, 0, 1.0]))
+    T = transform(R, np.array([0.4, 0, 0.1]) - R @ np.array([0.02, 0, 0.2]))
+    T[:, :3, 3] += np.random.default_rng(0).normal(0, 1e-4, (20, 3))
+    result = calibrate_tip(T, method)
+    assert len(result.weak) == 1
+    assert "along z of the tool" in result.weak[0]
+    assert "not determined" in result.weak[0]
+
+
+def test_an_unknown_method_is_refused(poses: np.ndarray) -> None:
+    with pytest.raises(CalibrationError, match="valid: least-squares, maximum-likelihood"):
+        calibrate_tip(poses, "ml")
