@@ -11,17 +11,22 @@ from rich.markup import escape
 import tiptrace
 from tiptrace.cli.calibrate_check import calibrate_check
 from tiptrace.cli.calibrate_gel import calibrate_gel
+from tiptrace.cli.calibrate_latency import calibrate_latency
 from tiptrace.cli.calibrate_rig import calibrate_rig
 from tiptrace.cli.calibrate_tip import calibrate_tip
 from tiptrace.cli.compare import compare
 from tiptrace.cli.demo import demo
 from tiptrace.cli.depth import depth
+from tiptrace.cli.doctor import doctor
 from tiptrace.cli.evaluate import evaluate
 from tiptrace.cli.export import export
 from tiptrace.cli.import_gel import import_gel
 from tiptrace.cli.inspect import inspect
+from tiptrace.cli.live import live
 from tiptrace.cli.plan_anchor import plan_anchor
 from tiptrace.cli.reconstruct import reconstruct
+from tiptrace.cli.record import record
+from tiptrace.cli.setup import setup
 from tiptrace.cli.simulate import simulate
 from tiptrace.cli.surface import surface
 from tiptrace.cli.track import track
@@ -46,12 +51,17 @@ app.command()(track)
 app.command()(depth)
 app.command()(compare)
 app.command()(export)
+app.command()(setup)
+app.command()(doctor)
+app.command()(record)
+app.command()(live)
 app.command("plan-anchor")(plan_anchor)
 app.command("import-gel")(import_gel)
 calibrate.command("gel")(calibrate_gel)
 calibrate.command("check")(calibrate_check)
 calibrate.command("tip")(calibrate_tip)
 calibrate.command("rig")(calibrate_rig)
+calibrate.command("latency")(calibrate_latency)
 
 
 def _version(show: bool) -> None:

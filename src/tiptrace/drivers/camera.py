@@ -16,7 +16,7 @@ from tiptrace.drivers.timeline import NS, Timeline
 from tiptrace.errors import DeviceError
 from tiptrace.types import Image
 
-_QUEUE = 50  # frames: two seconds, as the end of Stage I may take; the oldest goes first
+_QUEUE = 20  # frames: 0.8 s, as the end of Stage I may take; the oldest goes first
 _LATE_NS = round(0.3 * NS)
 _FROZEN = 5  # repeats in a row
 _STALE_S = 0.25

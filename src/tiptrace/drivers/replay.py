@@ -106,17 +106,19 @@ def _from_csv(path: Path) -> list[PoseSample]:
 def _from_mcap(path: Path) -> tuple[list[PoseSample], str | None]:
     """Poses of ``/ee_pose`` and the frame that they are in."""
     from mcap.exceptions import McapError
-    from mcap_ros2.reader import read_ros2_messages
+    from mcap.reader import make_reader
+    from mcap_ros2.decoder import DecoderFactory
 
     poses: list[PoseSample] = []
     base: str | None = None
     try:
-        for message in read_ros2_messages(str(path), topics=["/ee_pose"]):
-            m = message.ros_msg
-            p, o = m.pose.position, m.pose.orientation
-            stamp_ns = m.header.stamp.sec * NS + m.header.stamp.nanosec
-            base = m.header.frame_id or base
-            poses.append(_pose(stamp_ns, (p.x, p.y, p.z), [o.x, o.y, o.z, o.w]))
+        with path.open("rb") as file:
+            reader = make_reader(file, decoder_factories=[DecoderFactory()])
+            for _, _, _, m in reader.iter_decoded_messages(topics=["/ee_pose"]):
+                p, o = m.pose.position, m.pose.orientation
+                stamp_ns = m.header.stamp.sec * NS + m.header.stamp.nanosec
+                base = m.header.frame_id or base
+                poses.append(_pose(stamp_ns, (p.x, p.y, p.z), [o.x, o.y, o.z, o.w]))
     except (OSError, McapError, ValueError, AttributeError, GeometryError) as error:
         raise DeviceError(
             f"{path}: its poses cannot be read ({getattr(error, 'strerror', None) or error})"

@@ -110,7 +110,7 @@ class V4l2Source:
         self._uri, self._root, self._timeline = uri, root, timeline
         self._fourcc = (camera.fourcc if camera else None) or "MJPG"
         self._size_px = camera.size_px if camera else None
-        self.name = find_camera(uri, root).name if uri.startswith("v4l2:") else uri
+        self.name = find_camera(uri, root).name
         self._capture: Any = None
 
     def connect(self) -> None:

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
+from operator import itemgetter
 from types import TracebackType
 from typing import Protocol, Self
 
@@ -186,25 +187,23 @@ class LiveStream:
                     return
 
     def _gather(self) -> list[Sample]:
-        """What has come: marks and poses first, so that an image finds them there."""
-        frames: list[tuple[int, Side, Frame]] = []
+        """What has come, in the order of arrival, so that a busy loop finds each image among its own poses."""
+        found: list[tuple[int, Sample]] = []
         for side in SIDES:
-            frames += [(frame.arrived_ns, side, frame) for frame in self._cameras[side].take()]
-        found: list[Sample] = []
+            for frame in self._cameras[side].take():
+                self._arrived[side, frame.stamp_ns] = frame.arrived_ns
+                found.append((frame.arrived_ns, ImageSample(side, frame.stamp_ns, frame.image)))
         for sample in self._robot.take():
             if isinstance(sample, PhaseSample):
                 (self.on_phase or self.mark)(sample.phase)
             else:
-                found.append(sample)
+                found.append((sample.stamp_ns, sample))
         check_frames(self._robot.frames, self.rig.frames)
         with self._lock:
             marks, self._marks = self._marks, []
-        for arrived_ns, side, frame in sorted(frames, key=lambda item: item[0]):
-            self._arrived[side, frame.stamp_ns] = arrived_ns
-            found.append(ImageSample(side, frame.stamp_ns, frame.image))
         while len(self._arrived) > _ARRIVALS:
             self._arrived.popitem(last=False)
-        return [*marks, *found]
+        return [*marks, *(sample for _, sample in sorted(found, key=itemgetter(0)))]
 
     def _counts(self, sample: Sample) -> bool:
         return not self.standby and self._begin_ns is not None and sample.stamp_ns >= self._begin_ns
