@@ -235,6 +235,29 @@ class SensedPair:
 
 
 @dataclass(frozen=True, slots=True)
+class AnchorChecks:
+    """What a trial says of its own anchor, without any ground truth.
+
+    Attributes:
+        residual_m: Root mean square residual of Stage I.
+        held_out_m: The same in frames predicted from the others.
+        halves_m: Distance between the anchors of Stage I's two halves.
+        halves_sigma: The same over what their covariances predict, root mean square per axis.
+        prior_sigma: The anchor against the tip of the tool's file, likewise; None without one.
+        in_grasp_m: Root mean square distance of the trace from the end effector's with a constant tip.
+        closure_m: How far off the trace was where the tip was anchored anew; None where it never was.
+    """
+
+    residual_m: float
+    held_out_m: float
+    halves_m: float
+    halves_sigma: float
+    prior_sigma: float | None = None
+    in_grasp_m: float | None = None
+    closure_m: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class Anchor:
     """Stage I: where the resting tip is.
 
@@ -244,6 +267,7 @@ class Anchor:
         residual_m: Root mean square of the fixed-point residuals.
         frames: Anchoring frames used.
         weak_axes: Unit directions in which the data do not determine the tip, (3,) each.
+        checks: What the trial says of the anchor; None where the method does not look.
     """
 
     p_B: FloatArray
@@ -251,6 +275,7 @@ class Anchor:
     residual_m: float
     frames: int
     weak_axes: tuple[FloatArray, ...] = ()
+    checks: AnchorChecks | None = None
 
 
 @dataclass(frozen=True, slots=True)

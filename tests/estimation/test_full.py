@@ -185,16 +185,33 @@ def test_a_jumped_marker_is_named_and_does_no_harm() -> None:
     assert np.sqrt((e**2).sum(axis=1).mean()) < 4e-4
 
 
-def test_markers_that_slide_apart_mean_a_slip() -> None:
+def test_a_kick_into_another_pattern_means_a_slip() -> None:
+    def slip(k: int, x: FloatArray, pairs: list[SensedPair]) -> FloatArray:
+        if k >= 140:
+            x[:, 0] += 8e-4  # the gel relaxes at once
+            x[::2, 1] += 2e-4  # and grips elsewhere
+        return x
+
+    assert "grasp-slip" in kinds(slip)
+
+
+def test_pads_that_turn_apart_disagree() -> None:
     def slide(k: int, x: FloatArray, pairs: list[SensedPair]) -> FloatArray:
         if k >= 140:
             x[:, 1] += 0.04 * x[:, 0]  # this pad's markers turn, the other's do not
-            x[::2, 0] += 2e-4
         return x
 
-    found = kinds(slide)
-    assert "grasp-slip" in found
-    assert "left-right-disagreement" in found
+    assert "left-right-disagreement" in kinds(slide)
+
+
+def test_a_marker_that_stays_away_is_told() -> None:
+    def lose(k: int, x: FloatArray, pairs: list[SensedPair]) -> FloatArray:
+        if k >= 140:
+            x[31] = np.nan
+        return x
+
+    found = kinds(lose)
+    assert list(found) == ["marker-lost"]
 
 
 def test_a_gap_in_the_poses_is_told() -> None:

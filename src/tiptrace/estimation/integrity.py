@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from tiptrace.estimation.motion import Motions
-from tiptrace.types import BoolArray, FloatArray
+from tiptrace.estimation.motion import Motions, TemplateFit
+from tiptrace.estimation.slip_detector import SlipDetector, SlipLevels, slip_levels
+from tiptrace.types import BoolArray, FloatArray, IntArray
 
-_BEFORE, _AFTER = 10, 4  # frames compared for a slip
 _STILL, _STILL_SLOW = 4, 10  # frames over which a tool in the air hangs still, with and without a Stage I
 _DEPTH_SHARE = 0.3  # of a swing along the closing axis, which depends on depth and is noisier
 
@@ -28,11 +28,11 @@ class IntegrityConfig(BaseModel):
     # no marker of a finger moved by more: the image is the old one
     frozen_m: float = Field(default=2e-7, gt=0)
     stale_frames: int = Field(default=3, ge=2)
-    # A slip shears part of the markers: χ² of the rigid fit steps up and stays, mostly while the tip jumps.
-    # Under growing friction χ² also grows, but slowly.
-    misfit_step: float = Field(default=0.6, gt=0)  # of χ², and as a share of its level before
-    misfit_step_alone: float = Field(default=4.0, gt=0)  # the same, without a jump of the tip
-    tip_jump_m: float = Field(default=1.3e-3, gt=0)  # of the tip against the hand between two frames
+    # a slip: the tip is kicked against the hand, and the markers' pattern about the rigid fit is another afterwards
+    kick_m: float = Field(default=1.3e-3, gt=0)  # second difference of the tip's displacement
+    pattern_m: float = Field(default=4.0e-5, gt=0)  # rms over the markers
+    pattern_alone_m: float = Field(default=4.0e-4, gt=0)  # the same, without a kick
+    slip_margin: float = Field(default=1.3, ge=1)  # over what Stage I showed
     # of one marker between two frames, beyond the tool's own motion
     jump_m: float = Field(default=1.2e-3, gt=0)
     twist_limit_rad: float = Field(default=0.03, gt=0)  # of one pad's markers against the other's
@@ -44,6 +44,7 @@ class IntegrityConfig(BaseModel):
     unloaded_m: float = Field(default=1.5e-3, gt=0)  # across its axis, of where it hung before the hand moved
     unloaded_again_m: float = Field(default=1.0e-3, gt=0)  # of where it hung in the air before
     regain_m: float = Field(default=2e-4, gt=0)
+    lost_frames: int = Field(default=5, ge=1)  # a marker not seen for so long is told
     pose_gap_s: float = Field(default=0.1, gt=0)
 
 
@@ -59,6 +60,8 @@ class Reference:
         start_E: (3,) displacement D before the hand moved: nothing pulls the tip aside then. None without a Stage I.
         twist_rad: Median twist of the left pad's markers against the right's.
         twist_spread_rad: Its spread (1.48 × median absolute deviation).
+        slip: How much frames differ where nothing slips.
+        rows: Markers in use.
     """
 
     chi2: float
@@ -68,29 +71,45 @@ class Reference:
     start_E: FloatArray | None
     twist_rad: float
     twist_spread_rad: float
+    slip: SlipLevels
+    rows: IntArray
 
 
 def reference(
-    motions: Motions, c_E: FloatArray, normal_E: FloatArray, twists: FloatArray, staged: bool = True
+    fit: TemplateFit,
+    X: FloatArray,
+    motions: Motions,
+    c_E: FloatArray,
+    normal_E: FloatArray,
+    staged: bool = True,
 ) -> Reference:
-    """From the motions of Stage I, the tip in F_E, and the pads' twists (T,).
+    """What T frames show.
 
     Args:
-        motions: T frames.
+        fit: Their template.
+        X: (T, N, 3) markers in F_E.
+        motions: Fitted to them.
         c_E: (3,) tip in F_E.
         normal_E: (3,) closing axis in F_E.
-        twists: (T,) of the left pad's markers against the right's, rad.
         staged: Whether the frames are a Stage I, which starts with the hand at rest.
     """
+    residual = np.stack([fit.residual(x, motions, k) for k, x in enumerate(X)])  # (T, N, 3)
+    twists = np.array([fit.twist(r) for r in residual])
     axis = c_E - motions.centre.mean(axis=0)
     axis = axis / np.linalg.norm(axis)
     D = motions.R @ c_E + motions.t - c_E  # (T, 3)
     low, high = np.percentile(D @ axis, [5, 95])
     middle = float(np.median(twists))
-    spread = 1.48 * float(np.median(np.abs(twists - middle)))
-    start = np.median(D[:5], axis=0) if staged else None
     return Reference(
-        float(np.median(motions.chi2)), axis, normal_E, (float(low), float(high)), start, middle, spread
+        chi2=float(np.median(motions.chi2)),
+        axis_E=axis,
+        normal_E=normal_E,
+        axial_m=(float(low), float(high)),
+        start_E=np.median(D[:5], axis=0) if staged else None,
+        twist_rad=middle,
+        twist_spread_rad=1.48 * float(np.median(np.abs(twists - middle))),
+        slip=slip_levels(D, residual, normal_E) if staged else SlipLevels(0.0, 0.0),
+        rows=np.flatnonzero(fit.trust > 0),
     )
 
 
@@ -103,6 +122,7 @@ class Findings:
         frozen: The frames stand still for longer.
         slipping: The markers no longer move as one body.
         jumped: Rows of markers that jumped.
+        lost: Rows of markers in use that have not been seen for several frames.
         disagree: The pads twist against each other.
         in_contact: Whether the tip touches.
         axial_m: Displacement of the tool along its axis, out of the hand.
@@ -112,6 +132,7 @@ class Findings:
     frozen: bool
     slipping: bool
     jumped: BoolArray
+    lost: BoolArray
     disagree: bool
     in_contact: bool
     axial_m: float
@@ -125,8 +146,9 @@ class Monitor:
         self._last_S: FloatArray | None = None
         self._last_residual: FloatArray | None = None
         self._same = np.zeros(2, dtype=int)
-        self._recent: deque[tuple[float, FloatArray]] = deque(maxlen=_BEFORE + _AFTER)  # χ², D
+        self._slip = SlipDetector(config.kick_m, config.pattern_m, config.pattern_alone_m, config.slip_margin)
         self._path: deque[FloatArray] = deque(maxlen=_STILL_SLOW)
+        self._unseen = np.zeros(0, dtype=int)
         self._twisted = 0
         self._contact = True
         self._free_m: float | None = None
@@ -172,7 +194,7 @@ class Monitor:
         D = motions.R[0] @ c_E + motions.t[0] - c_E
         axial = float(D @ ref.axis_E)
         self._judge_contact(D, ref)
-        slipping = self._slipped(float(motions.chi2[0]), D)
+        slipping = self._slip.update(D, residual_E, ref.normal_E, ref.slip)
         limit = max(c.twist_limit_rad, 6.0 * ref.twist_spread_rad)
         twisted = abs(twist_rad - ref.twist_rad) > limit
         self._twisted = self._twisted + 1 if twisted else 0
@@ -181,27 +203,11 @@ class Monitor:
             frozen=self.frozen,
             slipping=slipping,
             jumped=self._jumped(residual_E),
+            lost=self._lost(residual_E, ref.rows),
             disagree=self._twisted >= c.twist_frames,
             in_contact=self._contact,
             axial_m=axial,
         )
-
-    def _slipped(self, chi2: float, D: FloatArray) -> bool:
-        """Whether χ² stepped up between the frames before and the last few."""
-        self._recent.append((chi2, D))
-        if len(self._recent) < _BEFORE + _AFTER:
-            return False
-        rows = list(self._recent)
-        before = float(np.median([q for q, _ in rows[:_BEFORE]]))
-        step = float(np.median([q for q, _ in rows[_BEFORE:]])) - before
-        path = np.stack([d for _, d in rows[_BEFORE - 2 :]])
-        jump = float(np.linalg.norm(np.diff(path, axis=0), axis=1).max())
-        c = self._config
-        alone = step > c.misfit_step_alone * max(1.0, before)
-        with_jump = step > c.misfit_step * max(1.0, before) and jump > c.tip_jump_m
-        if alone or with_jump:
-            self._recent.clear()  # the level after the slip is the new one
-        return bool(alone or with_jump)
 
     def _judge_contact(self, D: FloatArray, ref: Reference) -> None:
         """In the air the tool has sprung out along its axis, hangs still, and nothing pulls it aside any more.
@@ -238,6 +244,14 @@ class Monitor:
         if self._free_E is None:
             return False
         return bool(np.linalg.norm(D - self._free_E) < self._config.unloaded_again_m)
+
+    def _lost(self, residual_E: FloatArray, rows: IntArray) -> BoolArray:
+        unseen = np.zeros(len(residual_E), dtype=int)
+        missing = rows[~np.isfinite(residual_E[rows, 0])]
+        if len(self._unseen) == len(unseen):
+            unseen[missing] = self._unseen[missing] + 1
+        self._unseen = unseen
+        return np.asarray(unseen >= self._config.lost_frames)
 
     def _jumped(self, residual_E: FloatArray) -> BoolArray:
         last, self._last_residual = self._last_residual, residual_E

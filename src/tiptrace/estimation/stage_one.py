@@ -143,7 +143,7 @@ class StageOne:
         tip_map = solve_tip_map(
             motions, hand_at, phase, duration, self._tip_map, latency, prior, self._normal
         )
-        ref = _reference(fit, X, motions, tip_map.c, self._normal)
+        ref = reference(fit, X, motions, tip_map.c, self._normal)
         hand = hand_at(tip_map.latency_s)
         return Anchoring(tip_map, fit, weights, kept, motions, hand, ref, int(stamps[0]))
 
@@ -154,7 +154,7 @@ class StageOne:
         motions = fit.fit(X)
         tip_map = assumed_tip_map(tip, self._tip_map, latency, self._normal)
         stamps = np.array([s for s, _ in self._frames], dtype=np.float64)
-        ref = _reference(fit, X, motions, tip.c, self._normal, staged=False)
+        ref = reference(fit, X, motions, tip.c, self._normal, staged=False)
         return Anchoring(tip_map, fit, self.trust(), stamps, motions, None, ref, int(stamps[0]))
 
     @property
@@ -211,18 +211,6 @@ def _first_seen(X: FloatArray) -> FloatArray:
 
 def _select(m: Motions, good: BoolArray) -> Motions:
     return Motions(*(getattr(m, name)[good] for name in Motions.__slots__))
-
-
-def _reference(
-    fit: TemplateFit,
-    X: FloatArray,
-    motions: Motions,
-    c_E: FloatArray,
-    normal_E: FloatArray,
-    staged: bool = True,
-) -> Reference:
-    twists = np.array([fit.twist(fit.residual(x, motions, k)) for k, x in enumerate(X)])
-    return reference(motions, c_E, normal_E, twists, staged)
 
 
 class RunningTip:

@@ -63,6 +63,10 @@ class Verdict:
             self.log.note(
                 kind, stamp_ns, stamp_ns, f"the {' and '.join(names)} finger delivered an old frame"
             )
+        if f.lost.any():
+            gone = np.flatnonzero(f.lost)
+            named = ", ".join(str(k) for k in gone[:5]) + (" and others" if len(gone) > 5 else "")
+            self.log.note("marker-lost", stamp_ns, stamp_ns, f"markers {named} are no longer seen")
         if f.jumped.any():
             rows = ", ".join(str(k) for k in np.flatnonzero(f.jumped)[:5])
             self.log.note("marker-jump", stamp_ns, stamp_ns, f"markers {rows} jumped away from the rest")

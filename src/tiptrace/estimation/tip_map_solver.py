@@ -1,0 +1,289 @@
+"""The solve behind the tip map: Gauss-Helmert over c, p, G, τ and ċ, with robust weights and gates' priors kept.
+
+Unknowns in order: c (3), p (3), G (9, row-major), τ (1), ċ (3).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from tiptrace.estimation.anchor import TipPrior, fixed_point_ml
+from tiptrace.estimation.information import inflation, scaled_inverse
+from tiptrace.estimation.motion import Motions
+from tiptrace.estimation.pose_track import HandStates
+from tiptrace.estimation.robust import scale_from_median, tukey_weight
+from tiptrace.geometry.transforms import rotation_exp, skew
+from tiptrace.types import AnchorChecks, BoolArray, FloatArray, IntArray
+
+C, P, G_, TAU, DRIFT = slice(0, 3), slice(3, 6), slice(6, 15), slice(15, 16), slice(16, 19)
+SIZE = 19
+I9 = np.eye(3).ravel()
+DIAGONAL = I9 > 0
+
+HandAt = Callable[[float], HandStates]
+"""Latency in s → the hand at every frame's exposure."""
+
+
+class TipMapConfig(BaseModel):
+    """Priors and gates."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    learn_map: bool = True
+    map_sigma: float = Field(default=0.10, gt=0)
+    map_off_diagonal_sigma: float = Field(default=0.06, gt=0)
+    map_shear_correlation: float = Field(default=0.8, ge=0, lt=1)  # of the two axes along the pads
+    map_gate_m: float = Field(default=1e-3, gt=0)  # standard deviation of the enforced motion along an axis
+    latency_s: float = 0.050  # where the rig says nothing
+    latency_std_s: float = Field(default=0.030, gt=0)
+    latency_gate_s: float = Field(default=0.010, gt=0)
+    drift_sigma_m: float = Field(default=3e-3, gt=0)  # along the pads
+    drift_normal_sigma_m: float = Field(default=1e-4, gt=0)  # across them, where the tool cannot slip
+    hidden_drift: float = Field(default=0.3, ge=0)  # share of its σ that a drift without evidence still has
+    drift_evidence: float = Field(default=3.0, gt=0)  # sigmas
+    pose_sigma_m: float = Field(default=4e-5, gt=0)  # of the tip through the smoothed hand pose
+    model_sigma_m: float = Field(default=1e-4, gt=0)  # what a linear map leaves
+    outlier: float = Field(default=6.0, gt=0)  # whitened residual of a frame in which the tip did not rest
+    iterations: int = Field(default=15, ge=3)
+
+
+@dataclass(frozen=True, slots=True)
+class Solution:
+    """Result of one solve.
+
+    Attributes:
+        theta: (19,) unknowns.
+        covariance: (19, 19).
+        learned: (19,) which of them were free.
+        rms: Root mean square residual, m.
+        factor: How many frames say the same.
+        r: (T, 3) residuals in F_E, m.
+        delta: (T, 6) corrections of the motions.
+        weights: (T,) robust weights.
+    """
+
+    theta: FloatArray
+    covariance: FloatArray
+    learned: BoolArray
+    rms: float
+    factor: float
+    r: FloatArray
+    delta: FloatArray
+    weights: FloatArray
+
+    @property
+    def drift(self) -> FloatArray:
+        """(3,) displacement in the grasp over Stage I, m."""
+        return self.theta[DRIFT]
+
+
+class Solver:
+    """Stage I as equations; a few solves over different free unknowns share it."""
+
+    def __init__(
+        self,
+        motions: Motions,
+        hand_at: HandAt,
+        phase: FloatArray,
+        config: TipMapConfig,
+        latency: tuple[float, float],
+        prior: TipPrior | None,
+        normal: FloatArray,
+    ) -> None:
+        self._m, self._hand_at, self._phase, self._config = motions, hand_at, phase, config
+        self._latency, self._prior = latency, prior
+        self._mean = np.concatenate([np.zeros(6), I9, [latency[0]], np.zeros(3)])
+        self._prior_P = np.zeros((SIZE, SIZE))  # of what has a prior; c and p have none here
+        self._prior_P[G_, G_] = map_prior(config, normal)
+        self._prior_P[TAU, TAU] = latency[1] ** 2
+        across = np.outer(normal, normal)
+        self._prior_P[DRIFT, DRIFT] = (
+            config.drift_sigma_m**2 * (np.eye(3) - across) + config.drift_normal_sigma_m**2 * across
+        )
+        self._prior_N = np.zeros((SIZE, SIZE))
+        self._prior_N[6:, 6:] = np.linalg.inv(self._prior_P[6:, 6:])
+        if prior is not None:
+            self._mean[C] = prior.c
+            self._prior_N[C, C] = np.linalg.inv(prior.covariance)
+
+    def start(self) -> FloatArray:
+        """Maximum likelihood with the gel taken at its word and the latency at its prior."""
+        T = self._hand_at(self._latency[0]).T_B_E
+        R_BE = T[:, :3, :3]
+        rotate = np.zeros((len(T), 6, 6))
+        rotate[:, :3, :3] = rotate[:, 3:, 3:] = R_BE
+        t = np.einsum("tij,tj->ti", R_BE, self._m.t) + T[:, :3, 3]
+        centre = np.einsum("tij,tj->ti", R_BE, self._m.centre) + T[:, :3, 3]
+        Sigma = rotate @ self._m.covariance @ np.swapaxes(rotate, 1, 2)
+        Sigma[:, range(3, 6), range(3, 6)] += self._config.pose_sigma_m**2 + self._config.model_sigma_m**2
+        point = fixed_point_ml(R_BE @ self._m.R, t, Sigma, centre, prior=self._prior, outliers=True)
+        theta = self._mean.copy()
+        theta[C], theta[P] = point.c, point.p
+        return theta
+
+    def map_is_absurd(self, solution: Solution) -> bool:
+        """Whether the fit left its prior by more than four sigmas: the tip did not rest, or the map diverged."""
+        off = solution.theta[G_] - I9
+        return bool(off @ np.linalg.solve(self._prior_P[G_, G_], off) > 4.0**2 + 9.0)
+
+    def moved(self, theta: FloatArray) -> FloatArray:
+        """Standard deviation of the enforced motion along each axis of F_E, (3,) m."""
+        T = self._hand_at(float(theta[15])).T_B_E
+        u = np.einsum("tji,tj->ti", T[:, :3, :3], theta[P] - T[:, :3, 3])
+        return np.asarray(u.std(axis=0))
+
+    def solve(self, theta: FloatArray, free: BoolArray) -> Solution:
+        """Gauss-Helmert iterations over the free unknowns; the others stay at their prior."""
+        theta = np.where(free, theta, self._mean)
+        k = np.zeros((len(self._phase), 3))
+        delta = np.zeros((len(self._phase), 6))
+        weights = np.ones(len(self._phase))
+        index = np.flatnonzero(free)
+        for iteration in range(self._config.iterations):
+            A, S_inv, w, lever = self._linearise(theta, delta)
+            WA = weights[:, None, None] * (S_inv @ A)
+            N = np.einsum("tij,tik->jk", A, WA, optimize=True) + self._prior_N
+            b = -np.einsum("tij,ti->j", WA, w) + self._prior_N @ (self._mean - theta)
+            N_ff = N[np.ix_(index, index)]
+            step = np.zeros(SIZE)
+            step[index] = np.linalg.solve(N_ff + 1e-12 * np.diag(np.diag(N_ff)), b[index])
+            misfit = w + A @ step
+            k = np.einsum("tij,tj->ti", S_inv, misfit)
+            length = np.sqrt(np.maximum(np.einsum("ti,ti->t", misfit, k), 0.0))
+            scale = max(1.0, scale_from_median(length))
+            weights = tukey_weight(length, max(self._config.outlier, 20.0 * 0.7**iteration) * scale)
+            delta = -np.einsum(
+                "tij,tj->ti", self._m.covariance, np.concatenate([np.cross(lever, k), k], axis=1)
+            )
+            theta = theta + step
+            if iteration > 4 and np.abs(step[:6]).max() < 1e-6:
+                break
+        return self._finish(theta, free, delta, weights)
+
+    def _linearise(
+        self, theta: FloatArray, delta: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """A (T, 3, 19), S⁻¹ (T, 3, 3), misclosure (T, 3), lever (T, 3) at the corrected motions."""
+        m, T = self._m, len(self._phase)
+        p, G, tau = theta[P], theta[G_].reshape(3, 3), float(theta[15])
+        c_t = theta[C] + self._phase[:, None] * theta[DRIFT]  # (T, 3)
+        hand = self._hand_at(tau)
+        R_BE, t_BE = hand.T_B_E[:, :3, :3], hand.T_B_E[:, :3, 3]
+        q = np.einsum("tji,tj->ti", R_BE, p - t_BE)  # resting tip in F_E
+        u = q - c_t
+        du_ds = -np.cross(hand.rate_E, q) - np.einsum("tji,tj->ti", R_BE, hand.velocity_B)
+        E = rotation_exp(delta[:, :3])
+        R = E @ m.R
+        lever_0 = np.einsum("tij,tj->ti", m.R, c_t) + m.t - m.centre
+        lever = np.einsum("tij,tj->ti", E, lever_0)
+        y = lever + m.centre + delta[:, 3:]
+        B = np.concatenate([-skew(lever), np.broadcast_to(np.eye(3), (T, 3, 3))], axis=2)
+        S = B @ m.covariance @ np.swapaxes(B, 1, 2)
+        S[:, range(3), range(3)] += self._config.pose_sigma_m**2 + self._config.model_sigma_m**2
+        A = np.zeros((T, 3, SIZE))
+        A[:, :, C] = R - np.eye(3) + G
+        A[:, :, P] = -G @ np.swapaxes(R_BE, 1, 2)
+        for j in range(3):
+            A[:, j, 6 + 3 * j : 9 + 3 * j] = -u
+        A[:, :, 15] = du_ds @ G.T
+        A[:, :, DRIFT] = self._phase[:, None, None] * A[:, :, C]
+        r = y - c_t - u @ G.T
+        return A, np.linalg.inv(S), r - np.einsum("tij,tj->ti", B, delta), lever
+
+    def _finish(self, theta: FloatArray, free: BoolArray, delta: FloatArray, weights: FloatArray) -> Solution:
+        """Covariance with correlated residuals, rotation noise not counted as motion, gates' priors kept."""
+        A, S_inv, _, _ = self._linearise(theta, delta)
+        r = self._linearise(theta, np.zeros_like(delta))[2]
+        rested = weights > 0.1
+        factor = inflation(r[rested], S_inv[rested])
+        N = np.einsum("tij,tik->jk", A, weights[:, None, None] * (S_inv @ A), optimize=True) / factor
+        N[C, C] -= self._spurious(S_inv, weights) / factor
+        N += self._prior_N
+        f, h = np.flatnonzero(free), np.flatnonzero(~free)
+        h = h[(h >= 6) & (h < 16)]  # a drift that no evidence speaks for is not considered
+        P_ff = scaled_inverse(N[np.ix_(f, f)])
+        covariance = np.zeros((SIZE, SIZE))
+        covariance[np.ix_(f, f)] = P_ff
+        if len(h):
+            K = -P_ff @ N[np.ix_(f, h)]
+            P_h = self._prior_P[np.ix_(h, h)]
+            covariance[np.ix_(f, f)] += K @ P_h @ K.T
+            covariance[np.ix_(f, h)] = K @ P_h
+            covariance[np.ix_(h, f)] = P_h @ K.T
+            covariance[np.ix_(h, h)] = P_h
+        rms = float(np.sqrt(np.average(np.sum(r * r, axis=1), weights=np.maximum(weights, 1e-9))))
+        return Solution(theta, covariance, free, rms, factor, r, delta, weights)
+
+    def checks(self, best: Solution) -> AnchorChecks:
+        """Stage I against itself: its halves, frames predicted from the others, and the prior (one step each)."""
+        A, S_inv, w, _ = self._linearise(best.theta, best.delta)
+        T, f = len(w), np.flatnonzero(best.learned)
+        halves = [
+            self._step(A, S_inv, w, best, f, part) for part in (np.arange(T) < T // 2, np.arange(T) >= T // 2)
+        ]
+        apart = halves[0][0][P] - halves[1][0][P]
+        sigma = best.factor * (halves[0][1] + halves[1][1])
+        block = np.arange(T) * 8 // max(T, 1) % 2 == 0
+        squares, total = 0.0, 1e-9
+        for part in (block, ~block):  # solved on the others, judged here
+            step, _ = self._step(A, S_inv, w, best, f, ~part)
+            r = best.r[part] + A[part] @ step
+            squares += float(best.weights[part] @ np.sum(r * r, axis=1))
+            total += float(best.weights[part].sum())
+        whole, own = self._step(A, S_inv, w, best, f, np.ones(T, dtype=bool), C)
+        prior = None
+        if self._prior is not None:
+            off = best.theta[C] + whole[C] - self._prior.c
+            prior = float(
+                np.sqrt(off @ np.linalg.solve(self._prior.covariance + best.factor * own, off) / 3.0)
+            )
+        return AnchorChecks(
+            residual_m=best.rms,
+            held_out_m=float(np.sqrt(squares / total)),
+            halves_m=float(np.linalg.norm(apart)),
+            halves_sigma=float(np.sqrt(apart @ np.linalg.solve(sigma, apart) / 3.0)),
+            prior_sigma=prior,
+        )
+
+    def _step(
+        self,
+        A: FloatArray,
+        S_inv: FloatArray,
+        w: FloatArray,
+        best: Solution,
+        free: IntArray,
+        part: BoolArray,
+        block: slice = P,
+    ) -> tuple[FloatArray, FloatArray]:
+        """From the solution to that of some frames alone, without the tip's prior: (19,), and a (3, 3) covariance."""
+        W = (part * best.weights)[:, None, None] * S_inv
+        prior = self._prior_N.copy()
+        prior[C, C] = np.eye(3)  # 1 m
+        N = (np.einsum("tij,tik->jk", A, W @ A, optimize=True) + prior)[np.ix_(free, free)]
+        b = -np.einsum("tij,tik,tk->j", A, W, w, optimize=True) + self._prior_N @ (self._mean - best.theta)
+        b[C] = -np.einsum("tij,tik,tk->j", A[:, :, C], W, w, optimize=True)
+        inverse = scaled_inverse(N)
+        step = np.zeros(SIZE)
+        step[free] = inverse @ b[free]
+        here = np.flatnonzero(np.isin(free, np.arange(SIZE)[block]))
+        return step, inverse[np.ix_(here, here)]
+
+    def _spurious(self, S_inv: FloatArray, weights: FloatArray) -> FloatArray:
+        """Information on c that mere rotation noise seems to carry, (3, 3)."""
+        K = skew(np.eye(3))
+        E = np.einsum("tmn,mki,tkl,nlj->tij", self._m.covariance[:, :3, :3], K, S_inv, K, optimize=True)
+        return np.asarray(np.einsum("t,tki,tkl,tlj->ij", weights, self._m.R, E, self._m.R, optimize=True))
+
+
+def map_prior(config: TipMapConfig, normal: FloatArray) -> FloatArray:
+    """Covariance (9, 9) of G, row-major: what the gel shows along the two axes in the pads' plane is alike."""
+    basis = np.linalg.svd(normal[None])[2]  # rows: normal, two axes along the pads
+    sigma = np.where(np.eye(3) > 0, config.map_sigma, config.map_off_diagonal_sigma).ravel()
+    P = np.diag(sigma**2)
+    P[4, 8] = P[8, 4] = config.map_shear_correlation * config.map_sigma**2
+    turn = np.kron(basis.T, basis.T)  # G_E = basisᵀ G_pad basis
+    return np.asarray(turn @ P @ turn.T)
