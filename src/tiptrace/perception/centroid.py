@@ -84,15 +84,20 @@ def _halved_gel(grey: Grey, mask: BoolArray) -> tuple[Float32Map, Float32Map]:
     """Sums (1, h, w) and weights (h, w) of the pixels that are not masked, over 2 × 2: the gel is smooth."""
     H, W = grey.shape
     h, w = (H + 1) // 2, (W + 1) // 2
-    sums, weight = np.empty((1, h, w), dtype=np.float32), np.empty((h, w), dtype=np.float32)
+    sums, weight = np.zeros((1, h, w), dtype=np.float32), np.zeros((h, w), dtype=np.float32)
+    total, count = np.zeros(2 * w, dtype=np.float32), np.zeros(2 * w, dtype=np.float32)
+    quarter = np.float32(0.25)
     for v in range(h):
-        v1 = min(2 * v + 1, H - 1)
+        for k in range(2):
+            row, covered = grey[min(2 * v + k, H - 1)], mask[min(2 * v + k, H - 1)]
+            for u in range(W):
+                seen = np.float32(0.0) if covered[u] else quarter
+                total[u] = seen * np.float32(row[u]) + (total[u] if k else np.float32(0.0))
+                count[u] = seen + (count[u] if k else np.float32(0.0))
+        total[2 * w - 1], count[2 * w - 1] = total[W - 1], count[W - 1]
         for u in range(w):
-            u1 = min(2 * u + 1, W - 1)
-            a, b, c, d = not mask[2 * v, 2 * u], not mask[2 * v, u1], not mask[v1, 2 * u], not mask[v1, u1]
-            total = a * grey[2 * v, 2 * u] + b * grey[2 * v, u1] + c * grey[v1, 2 * u] + d * grey[v1, u1]
-            sums[0, v, u] = np.float32(0.25) * np.float32(total)
-            weight[v, u] = np.float32(0.25) * np.float32(a + b + c + d)
+            sums[0, v, u] = total[2 * u] + total[2 * u + 1]
+            weight[v, u] = count[2 * u] + count[2 * u + 1]
     return sums, weight
 
 
@@ -158,27 +163,33 @@ def _centroid(
     window: Float32Map, du: float, dv: float, radius: float, core: float
 ) -> tuple[float, float, float, float]:
     """Centroid (du, dv), ink and area in a window of contrasts, starting from (du, dv) off its middle."""
-    reach = window.shape[0] // 2
-    dark, count = 0.0, 0
-    for j in range(window.shape[0]):
-        for i in range(window.shape[1]):
-            if (i - reach - du) ** 2 + (j - reach - dv) ** 2 <= core * core:
-                dark += window[j, i]
-                count += 1
-    ink = dark / max(count, 1)
-    gain = np.float32(1.0 / max(ink, 0.05) / (1.0 - _FLOOR))
-    total, total_u, total_v = 0.0, 0.0, 0.0
-    for j in range(window.shape[0]):
-        for i in range(window.shape[1]):
-            rho = np.sqrt(np.float32((i - reach - du) ** 2 + (j - reach - dv) ** 2))
-            share = min(
-                max(gain * window[j, i] - np.float32(_FLOOR / (1.0 - _FLOOR)), np.float32(0)), np.float32(1)
-            )
-            if rho <= core:
-                share = np.float32(1)  # glints
-            weight = share * min(max(np.float32(radius + 0.5) - rho, np.float32(0)), np.float32(1))
-            total += weight
-            total_u += weight * (i - reach)
-            total_v += weight * (j - reach)
+    size = window.shape[0]
+    x, y = np.float32(du + size // 2), np.float32(dv + size // 2)
+    zero, one, core2 = np.float32(0.0), np.float32(1.0), np.float32(core * core)
+    dark, count = zero, zero
+    for j in range(size):
+        dy2 = (np.float32(j) - y) ** 2
+        for i in range(size):
+            inside = one if (np.float32(i) - x) ** 2 + dy2 <= core2 else zero
+            dark += inside * window[j, i]
+            count += inside
+    ink = dark / max(count, one)
+    gain = np.float32(1.0 / (1.0 - _FLOOR)) / max(ink, np.float32(0.05))
+    floor, rim = np.float32(_FLOOR / (1.0 - _FLOOR)), np.float32(radius + 0.5)
+    total, total_x, total_y = 0.0, 0.0, 0.0
+    for j in range(size):
+        dy = np.float32(j) - y
+        row, row_x = zero, zero
+        for i in range(size):
+            dx = np.float32(i) - x
+            rho2 = dx * dx + dy * dy
+            share = min(max(gain * window[j, i] - floor, zero), one)
+            share = one if rho2 <= core2 else share  # glints
+            weight = share * min(max(rim - np.sqrt(rho2), zero), one)
+            row += weight
+            row_x += weight * dx
+        total += float(row)
+        total_x += float(row_x)
+        total_y += float(row * dy)
     area = max(total, 1e-3)
-    return total_u / area, total_v / area, ink, area
+    return du + total_x / area, dv + total_y / area, float(ink), area

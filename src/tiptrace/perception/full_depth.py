@@ -20,7 +20,7 @@ from tiptrace.perception.illumination import LampGain, Level
 from tiptrace.perception.lifting import sample_map
 from tiptrace.perception.markers import check_image
 from tiptrace.perception.poisson import PoissonSolver
-from tiptrace.types import BoolArray, FloatArray, Image
+from tiptrace.types import BoolArray, FloatArray, Image, IntArray
 
 Float32Map = NDArray[np.float32]
 
@@ -60,10 +60,9 @@ class FullDepth:
         self._solver = PoissonSolver(shape, scale)
         self._level = Level(shape, scale)
         self._dot_fill: DotFill | None = None
-        self._lamps = LampGain(shape, lambda ratio: self._network(ratio, np.ones(3)))
-        self._flat = self._network(
-            np.ones_like(self._background), np.ones(3)
-        )  # what the network says of untouched gel
+        self._lamps = LampGain(shape, lambda ratio: self._network(ratio, np.ones(3)).reshape(*shape, 2))
+        # what the network says of untouched gel, (h, w, 2)
+        self._flat = self._network(np.ones_like(self._background), np.ones(3)).reshape(*shape, 2)
         self._box = 2 * round(_CALM_AROUND_PX / (2 * step)) + 1  # map px
         self._calm: BoolArray | None = None
         self._lean_little = np.ones(shape, dtype=np.bool_)
@@ -96,7 +95,8 @@ class FullDepth:
 
     def _measure(self, ratio: Float32Map, gain: FloatArray, mask: BoolArray, uv_px: FloatArray) -> DepthMap:
         """Depth from a ratio image (h, w, 3) and the lamps' gain (3,); remembers slopes and calm gel."""
-        slopes, weight = _change_beside(self._network(ratio, gain), self._flat, mask)  # (2, h, w), (h, w)
+        seen = np.flatnonzero(~mask)  # (k,)
+        slopes, weight = _change_at(seen, self._network(ratio, gain, seen), self._flat)  # (2, h, w), (h, w)
         pull_push(slopes, weight)
         if self._dot_fill is not None:
             self._dot_fill.apply(slopes, (uv_px - (self.step - 1) / 2) / self.step)
@@ -129,13 +129,12 @@ class FullDepth:
         fill = _FILL_SHARE * variation * radius_px * self._s
         return np.asarray(np.sqrt(_NOISE_M**2 + (_DEPTH_SHARE * depth_m) ** 2 + fill**2))
 
-    def _network(self, ratio: Float32Map, gain: FloatArray) -> Float32Map:
-        """Slopes (h, w, 2) of a ratio image (h, w, 3) under lamps with a gain (3,)."""
+    def _network(self, ratio: Float32Map, gain: FloatArray, which: IntArray | None = None) -> Float32Map:
+        """Slopes (k, 2) of some pixels of a ratio image (h, w, 3) under lamps with a gain (3,)."""
         if self._gel.convention.background == "ratio":
-            slopes = self._gel.slopes(ratio.reshape(-1, 3), self._unit_uv, gain, -1.0)
-        else:
-            slopes = self._gel.slopes((ratio * self._background).reshape(-1, 3), self._unit_uv, gain)
-        return slopes.reshape(*self.shape, 2)
+            return self._gel.slopes(ratio.reshape(-1, 3), self._unit_uv, gain, -1.0, which)
+        grey_levels = (ratio * self._background).reshape(-1, 3)
+        return self._gel.slopes(grey_levels, self._unit_uv, gain, 0.0, which)
 
     def _shrink(self, image: Float32Map) -> Float32Map:
         """Means over step × step pixels."""
@@ -169,16 +168,15 @@ def _ratio(image: Image, background: Float32Map, step: int) -> Float32Map:
 
 
 @compiled
-def _change_beside(slopes: Float32Map, flat: Float32Map, mask: BoolArray) -> tuple[Float32Map, Float32Map]:
-    """Slopes minus those of flat gel, (2, h, w), 0 under the mask, and weights (h, w): 1 off the mask."""
-    h, w = mask.shape
+def _change_at(seen: IntArray, slopes: Float32Map, flat: Float32Map) -> tuple[Float32Map, Float32Map]:
+    """Slopes (k, 2) of the seen pixels (k,) less those of flat gel (h, w, 2): (2, h, w), and weights (h, w)."""
+    h, w, _ = flat.shape
     change, weight = np.zeros((2, h, w), dtype=np.float32), np.zeros((h, w), dtype=np.float32)
-    for v in range(h):
-        for u in range(w):
-            if not mask[v, u]:
-                weight[v, u] = 1.0
-                change[0, v, u] = slopes[v, u, 0] - flat[v, u, 0]
-                change[1, v, u] = slopes[v, u, 1] - flat[v, u, 1]
+    for k in range(len(seen)):
+        v, u = seen[k] // w, seen[k] % w
+        weight[v, u] = 1.0
+        change[0, v, u] = slopes[k, 0] - flat[v, u, 0]
+        change[1, v, u] = slopes[k, 1] - flat[v, u, 1]
     return change, weight
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from tiptrace.errors import PerceptionError
 from tiptrace.perception.compiled import compiled
 from tiptrace.perception.gel_graph import MAX_BYTES, check_graph
-from tiptrace.types import FloatArray
+from tiptrace.types import FloatArray, IntArray
 
 Float32Array = NDArray[np.float32]
 
@@ -150,14 +150,16 @@ class GelModel:
         unit_uv: Float32Array,
         gain: FloatArray | None = None,
         offset: float = 0.0,
+        which: IntArray | None = None,
     ) -> Float32Array:
-        """Slopes (∂z/∂x, ∂z/∂y), (n, 2) m/m, of the gel surface (z out of the gel).
+        """Slopes (∂z/∂x, ∂z/∂y), (k, 2) m/m, of the gel surface (z out of the gel).
 
         Args:
             colours: (n, 3) in BGR order: grey levels 0 … 255 for ``background: none``, else ratio minus 1.
             unit_uv: (n, 2) u/W, v/H.
             gain: (3,) divides the colours; None: 1.
             offset: Is then added.
+            which: (k,) rows wanted; None: all, k = n.
         """
         c = self.convention
         scale = np.ones(3) if gain is None else 1.0 / gain
@@ -166,6 +168,7 @@ class GelModel:
         features = _features(
             np.ascontiguousarray(colours, dtype=np.float32),
             np.ascontiguousarray(unit_uv, dtype=np.float32),
+            np.arange(len(colours)) if which is None else which,
             scale.astype(np.float32),
             np.float32(offset),
             c.channels == "rgb",
@@ -180,22 +183,21 @@ class GelModel:
 def _features(
     colours: Float32Array,
     unit_uv: Float32Array,
+    which: IntArray,
     scale: Float32Array,
     offset: np.float32,
     reverse: bool,
     placed: bool,
 ) -> Float32Array:
-    """Network inputs (n, 5): colours scaled and ordered, and the place where it counts."""
-    n = len(colours)
-    features = np.zeros((n, 5), dtype=np.float32)
-    for c in range(3):
-        k = 2 - c if reverse else c
-        for i in range(n):
-            features[i, k] = colours[i, c] * scale[c] + offset
-    if placed:
-        for i in range(n):
-            features[i, 3] = unit_uv[i, 0]
-            features[i, 4] = unit_uv[i, 1]
+    """Network inputs (k, 5): colours of some rows scaled and ordered, and their place where it counts."""
+    features = np.zeros((len(which), 5), dtype=np.float32)
+    for row in range(len(which)):
+        i = which[row]
+        for c in range(3):
+            features[row, 2 - c if reverse else c] = colours[i, c] * scale[c] + offset
+        if placed:
+            features[row, 3] = unit_uv[i, 0]
+            features[row, 4] = unit_uv[i, 1]
     return features
 
 

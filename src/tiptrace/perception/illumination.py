@@ -161,10 +161,7 @@ class Level:
             self._tilt = tilt if self._tilt is None else self._tilt + _TILT_RATE * (tilt - self._tilt)
         tilt = np.zeros(2) if self._tilt is None else self._tilt
         z = _without_tilt(h, self._x, self._y, tilt)
-        if untouched is not None:
-            zero = _median_of(z, untouched)
-        else:
-            zero = float(np.percentile(np.concatenate([z[0], z[-1], z[:, 0], z[:, -1]]), 10))
+        zero = _border_decile(z) if untouched is None else _median_of(z, untouched)
         z -= np.float32(zero)
         return z
 
@@ -236,6 +233,16 @@ def _without_tilt(h: Float32Map, x: FloatArray, y: FloatArray, tilt: FloatArray)
         for u in range(W):
             z[v, u] = h[v, u] - row[u] - rise
     return z
+
+
+@compiled
+def _border_decile(z: Float32Map) -> float:
+    """What a tenth of the border's pixels lie below."""
+    H, W = z.shape
+    border = np.empty(2 * (H + W), dtype=np.float32)
+    border[:W], border[W : 2 * W] = z[0], z[H - 1]
+    border[2 * W : 2 * W + H], border[2 * W + H :] = z[:, 0], z[:, W - 1]
+    return float(np.sort(border)[round(0.1 * (len(border) - 1))])
 
 
 @compiled

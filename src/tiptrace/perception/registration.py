@@ -128,7 +128,7 @@ class RegisteredTracker:
         """Look for missing dots around their predicted places, darkest first."""
         self._frame += 1
         self._missed = np.where(seen, 0, self._missed + 1)
-        due = (self._missed <= _SEARCH_FRAMES) | ((self._frame + np.arange(len(seen))) % _SEARCH_FRAMES == 0)
+        due = (self._missed <= _SEARCH_FRAMES) | (self._frame % _SEARCH_FRAMES == 0)
         missing = np.flatnonzero(~seen & due & self._whole(guess, grey.shape))
         if not missing.size:
             return uv, seen
