@@ -115,7 +115,11 @@ def _errors() -> tuple[type[Exception], ...]:
     from rosbags.rosbag2 import ReaderError
     from rosbags.serde import SerdeError
 
-    return (AnyReaderError, ReaderError, SerdeError, *_DAMAGE)
+    try:
+        from apsw import Error as SqliteError  # newer rosbags read SQLite through it
+    except ImportError:
+        SqliteError = sqlite3.Error
+    return (AnyReaderError, ReaderError, SerdeError, SqliteError, *_DAMAGE)
 
 
 def _line(error: Exception) -> str:

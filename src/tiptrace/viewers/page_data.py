@@ -17,11 +17,11 @@ _MAX_EVENTS = 30
 def path_row(snapshot: Snapshot, start_ns: int) -> Row:
     """A point of the trajectory: t (s), x, y, z (mm), their standard deviations (mm), status."""
     estimate = snapshot.estimate
-    sigma = sigma_mm(snapshot) or [None] * 3
+    unknown: list[float | None] = [None] * 3
     return [
         round((estimate.stamp_ns - start_ns) * 1e-9, 3),
-        *(_mm(estimate.p_B) or [None] * 3),
-        *sigma,
+        *(_mm(estimate.p_B) or unknown),
+        *(sigma_mm(snapshot) or unknown),
         estimate.status.value,
     ]
 
