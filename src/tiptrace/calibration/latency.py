@@ -70,7 +70,7 @@ def calibrate_latency(pairs: Iterable[SensedPair]) -> LatencyCalibration:
     std_s = max(std_s, 0.35 * abs(halves[1] - halves[0]))  # halves that differ are worth that much
     if whole.tip_map.residual_m > _RESTLESS_M:
         raise CalibrationError(
-            f"the tip does not rest: it moves by {whole.tip_map.residual_m * 1e3:.1f} mm rms against the hand's motion; "
+            f"the tip does not rest: it moves by {whole.tip_map.residual_m * 1e3:.1f} mm rms against the hand; "
             "use a pit, and enough contact force"
         )
     if std_s > _VAGUE_S:
