@@ -44,6 +44,7 @@ class GelTrainingReport:
         max_slope: Steepest slope in the training presses; steeper ones are extrapolated.
         mm_per_px: Scale used.
         scale_is_assumed: True if nobody gave the scale.
+        view_mm: Width and height of gel that the image shows at this scale.
         marker_pitch_mm: What the scale makes of the markers' pitch; None without dots.
         valid_px: (u_min, v_min, u_max, v_max) that the contacts of the training presses cover.
         one_place: True if the presses cover too little of the gel to teach its dependence on place; the model
@@ -62,6 +63,7 @@ class GelTrainingReport:
     max_slope: float
     mm_per_px: tuple[float, float]
     scale_is_assumed: bool
+    view_mm: tuple[float, float]
     marker_pitch_mm: float | None
     valid_px: tuple[float, float, float, float]
     one_place: bool
@@ -135,6 +137,7 @@ def train_gel(
         max_slope=shading.max_slope,
         mm_per_px=data.mm_per_px,
         scale_is_assumed=data.scale_is_assumed,
+        view_mm=(data.reference.shape[1] * data.mm_per_px[0], data.reference.shape[0] * data.mm_per_px[1]),
         marker_pitch_mm=None if pitch is None else pitch * float(np.mean(data.mm_per_px)),
         valid_px=valid,
         one_place=one_place,

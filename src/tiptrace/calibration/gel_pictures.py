@@ -28,7 +28,7 @@ def draw_press(score: PressScore, press: Press, folder: PressFolder, path: Path)
     h, w = depth_mm.shape
     x0, y0 = (u0 - c.u) * scale, (v0 - c.v) * scale
     extent = (x0, x0 + w * scale, y0 + h * scale, y0)
-    figure = Figure(figsize=(9.6, 3.1), layout="constrained")
+    figure = Figure(figsize=(10.2, 3.1), layout="constrained")
     FigureCanvasAgg(figure)
     seen, measured, cut = figure.subplots(1, 3)
     seen.imshow(press.image[window][..., ::-1], extent=extent)
@@ -47,7 +47,7 @@ def draw_press(score: PressScore, press: Press, folder: PressFolder, path: Path)
     offset = np.median(-depth_mm[row][near] - (R - np.sqrt(R**2 - x_mm[near] ** 2)))
     cut.plot(x_mm[inside], ball + offset, color=_BALL, linestyle="--", label="ball")
     cut.set(
-        title=f"Cut at y = 0: normal error {score.normal_error_deg:.1f}°",
+        title=f"Cut: normal error {score.normal_error_deg:.1f}°",
         xlabel="x [mm]",
         ylabel="height [mm]",
     )

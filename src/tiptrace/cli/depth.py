@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
 
 def depth(
-    image: Annotated[Path, typer.Argument(help="Tactile image.")],
-    reference: Annotated[Path, typer.Option(help="Image of the same gel, untouched.")],
+    image: Annotated[Path, typer.Argument(exists=True, dir_okay=False, help="Tactile image.")],
+    reference: Annotated[
+        Path, typer.Option(exists=True, dir_okay=False, help="Image of the same gel, untouched.")
+    ],
     gel: Annotated[str, typer.Option(help="Gel model: a packaged name or an ONNX file.")],
-    mm_per_px: Annotated[float, typer.Option(help="Scale of the image.", min=1e-4, max=1.0)],
+    mm_per_px: Annotated[
+        float | None, typer.Option(help="Scale of the image; default: the gel model's.", min=1e-4, max=1.0)
+    ] = None,
     out: Annotated[
         Path, typer.Option(help="Folder for depth.npy (m, positive = pressed in) and depth.png.")
     ] = Path("depth"),
@@ -23,34 +31,58 @@ def depth(
         tuple[float, float], typer.Option(help="Grey levels that count as marker (paper).")
     ] = (0.0, 70.0),
 ) -> None:
-    """Depth of a tactile image against the untouched gel, metric.
+    """Depth of a tactile image against the untouched gel, metric; gels with and without dots.
+
+    Needs a gel model from 'calibrate gel' or 'import-gel'; without one, 'track --patch' shows the contact in the
+    plane.
 
     Example: tiptrace depth press.png --reference ref.png --gel gel.onnx --mm-per-px 0.0625 --out depth
     """
     import numpy as np
 
+    from tiptrace.cli.files import check_writable
+    from tiptrace.errors import PerceptionError
     from tiptrace.evaluation.atomic import write_atomic
     from tiptrace.perception.gel_model import load_gel_model
     from tiptrace.perception.still import depth_of_image, read_image
 
+    check_writable(out / "depth.npy")
     picture, untouched = read_image(image), read_image(reference)
+    model = load_gel_model(gel)
+    scale = model.mm_per_px if mm_per_px is None else (mm_per_px, mm_per_px)
+    if scale is None:
+        raise PerceptionError(f"gel model '{gel}' does not say its scale; give --mm-per-px")
     result = depth_of_image(
         picture,
         untouched,
-        load_gel_model(gel),
-        (mm_per_px * 1e-3, mm_per_px * 1e-3),
+        model,
+        (scale[0] * 1e-3, scale[1] * 1e-3),
         method,
         marker_threshold,
     )
     out.mkdir(parents=True, exist_ok=True)
     np.save(out / "depth.npy", result.depth_m)
-    write_atomic(out / "depth.png", _draw(picture, result.depth_m, mm_per_px))
+    write_atomic(out / "depth.png", _draw(picture, result.depth_m, scale))
     deepest = float(result.depth_m.max()) * 1e3
     note = "" if result.zero_visible else "; no untouched gel visible, zero taken from the border"
+    note += _outside(result.depth_m, model.metadata)
     typer.echo(f"{out / 'depth.npy'}: deepest {deepest:.3f} mm{note}   picture: {out / 'depth.png'}")
 
 
-def _draw(image: object, depth_m: object, mm_per_px: float) -> bytes:
+def _outside(depth_m: NDArray[np.float32], metadata: dict[str, str]) -> str:
+    """A note if the contact lies where the gel model was not calibrated."""
+    import numpy as np
+
+    if metadata.get("tiptrace.one_place") != "yes":
+        return ""
+    u0, v0, u1, v1 = (float(x) for x in metadata["tiptrace.valid_px"].split(","))
+    v, u = np.unravel_index(int(np.argmax(depth_m)), depth_m.shape)
+    if u0 <= u <= u1 and v0 <= v <= v1:
+        return ""
+    return f"; the gel model was calibrated around u {u0:.0f}–{u1:.0f}, v {v0:.0f}–{v1:.0f} px only, this is elsewhere"
+
+
+def _draw(image: object, depth_m: object, mm_per_px: tuple[float, float]) -> bytes:
     """Image and depth map side by side, axes and colours in mm, as PNG."""
     import io
 
@@ -59,7 +91,7 @@ def _draw(image: object, depth_m: object, mm_per_px: float) -> bytes:
     from tiptrace.evaluation import style
 
     picture, map_mm = np.asarray(image), np.asarray(depth_m) * 1e3
-    height, width = picture.shape[0] * mm_per_px, picture.shape[1] * mm_per_px
+    height, width = picture.shape[0] * mm_per_px[1], picture.shape[1] * mm_per_px[0]
     extent = (-width / 2, width / 2, height / 2, -height / 2)
     figure = style.new_figure(7.2, 3.0)
     left, right = figure.subplots(1, 2)

@@ -9,7 +9,12 @@ import typer
 
 
 def import_gel(
-    weights: Annotated[Path, typer.Argument(help="The vendor's weights (.pt or .pth); torch is not needed.")],
+    weights: Annotated[
+        Path,
+        typer.Argument(
+            exists=True, dir_okay=False, help="The vendor's weights (.pt or .pth); torch is not needed."
+        ),
+    ],
     convention: Annotated[
         str,
         typer.Option(help="How they were trained: gsrobotics, gsrobotics-unit, gsrobotics-rgb or gs-sdk."),
@@ -23,7 +28,9 @@ def import_gel(
     Example: tiptrace import-gel nnmini.pt --convention gsrobotics --out gel.onnx
     """
     from tiptrace.calibration.gel_import import import_gel as convert
+    from tiptrace.cli.files import check_writable
 
+    check_writable(out)
     report = convert(weights, out, convention)
     c = report.convention
     typer.echo(

@@ -12,11 +12,13 @@ if TYPE_CHECKING:
     import cv2
 
     from tiptrace.perception.video import VideoFrame
-    from tiptrace.types import FloatArray, Image
+    from tiptrace.types import BoolArray, FloatArray, Image
 
 
 def track(
-    video: Annotated[Path, typer.Argument(help="Video of a gel with marker dots.")],
+    video: Annotated[
+        Path, typer.Argument(exists=True, dir_okay=False, help="Video of a gel with marker dots.")
+    ],
     out: Annotated[
         Path, typer.Option(help="csv to write: frame, marker, u_px, v_px, status (tracked or lost).")
     ] = Path("tracks.csv"),
@@ -26,24 +28,43 @@ def track(
     method: Annotated[
         Literal["full", "paper"], typer.Option(help="full: drift-free; paper: plain Lucas–Kanade.")
     ] = "full",
+    patch: Annotated[
+        bool,
+        typer.Option(
+            "--patch",
+            help="Also a column patch: 1 where a marker lies under the object, told from its motion alone, as "
+            "'reconstruct --depth none' tells it.",
+        ),
+    ] = False,
 ) -> None:
     """Find the markers in a video's first frame and follow each under its own number.
 
-    Example: tiptrace track press.avi --out tracks.csv --overlay tracks.mp4
+    No gel model is needed. Lost markers keep their number and come back under it.
+
+    Examples: tiptrace track press.avi --out tracks.csv --overlay tracks.mp4;
+    tiptrace track press.avi --patch
     """
+    from tiptrace.cli.files import check_writable
     from tiptrace.cli.show import progress_bar
+    from tiptrace.perception.planar import MotionPatch
     from tiptrace.perception.video import Video
 
     source = Video(video)
+    for path in (out,) if overlay is None else (out, overlay):
+        check_writable(path)
     with ExitStack() as stack:
         progress = stack.enter_context(progress_bar())
         table = stack.enter_context(out.open("w", newline="\n"))
-        table.write("frame,marker,u_px,v_px,status\n")
+        table.write("frame,marker,u_px,v_px,status" + (",patch" if patch else "") + "\n")
         task = progress.add_task(f"tracking {video.name}", total=source.frame_count or None)
         drawing = None if overlay is None else stack.enter_context(_Overlay(overlay, source.fps))
         frames = lost = markers = 0
+        motion: MotionPatch | None = None
         for frame in source.track(method):
-            table.writelines(_rows(frame))
+            if patch and motion is None:
+                motion = MotionPatch(frame.uv_px.copy())
+            under = None if motion is None else motion.update(frame.uv_px, frame.tracked)
+            table.writelines(_rows(frame, under))
             if drawing is not None:
                 drawing.add(frame)
             frames, markers, lost = frame.index + 1, len(frame.uv_px), int((~frame.tracked).sum())
@@ -51,11 +72,12 @@ def track(
     typer.echo(f"{out}: {markers} markers in {frames} frames, {lost} lost at the end")
 
 
-def _rows(frame: VideoFrame) -> list[str]:
+def _rows(frame: VideoFrame, patch: BoolArray | None) -> list[str]:
     rows = []
     for marker, ((u, v), tracked) in enumerate(zip(frame.uv_px, frame.tracked, strict=True)):
         place = f"{u:.3f},{v:.3f},tracked" if tracked else ",,lost"
-        rows.append(f"{frame.index},{marker},{place}\n")
+        under = "" if patch is None else f",{int(patch[marker])}"
+        rows.append(f"{frame.index},{marker},{place}{under}\n")
     return rows
 
 
