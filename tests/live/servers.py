@@ -76,8 +76,17 @@ class Feed:
         return interpolate_screw(self.T_B_E[k : k + 1], self.T_B_E[k + 1 : k + 2], np.array([u]))[0]
 
 
-def feed_from(samples: Sequence[object], scale: int = 1, quality: int = 95, offset_s: float = 0.0) -> Feed:
-    """From a recording's samples; ``scale`` 2 plays 320×240 as 640×480; the right camera lags by ``offset_s``."""
+def feed_from(
+    samples: Sequence[object],
+    scale: int = 1,
+    quality: int = 95,
+    offset_s: float = 0.0,
+    latency_s: float = 0.0,
+) -> Feed:
+    """From a recording's samples; ``scale`` 2 plays 320×240 as 640×480; the right camera lags by ``offset_s``.
+
+    Poses are played later by ``latency_s``, so that a recording with that latency plays without one, both ways.
+    """
     images: dict[Side, list[ImageSample]] = {"left": [], "right": []}
     poses: list[PoseSample] = []
     for sample in samples:
@@ -94,7 +103,7 @@ def feed_from(samples: Sequence[object], scale: int = 1, quality: int = 95, offs
             side: np.array([(s.stamp_ns - first) * 1e-9 for s in images[side]]) + shift
             for side, shift in shifts.items()
         },
-        pose_s=np.array([(p.stamp_ns - first) * 1e-9 for p in poses]),
+        pose_s=np.array([(p.stamp_ns - first) * 1e-9 + latency_s for p in poses]),
         T_B_E=np.stack([p.T_B_E for p in poses]),
         duration_s=(last - first) * 1e-9 + 1.0 / FPS,
     )
@@ -368,12 +377,17 @@ def play_arm(
 
 
 def play_trial(
-    path: Path, start: float, faults: tuple[Fault, ...], ports: tuple[int, int], ready: Event
+    path: Path,
+    start: float,
+    faults: tuple[Fault, ...],
+    ports: tuple[int, int],
+    latency_s: float,
+    ready: Event,
 ) -> None:
     """Both cameras at 640×480 and an arm, from a recording; for :func:`in_child`."""
     from tiptrace.streams.recording import Recording
 
-    feed = feed_from(list(Recording(path)), scale=2, quality=90, offset_s=0.004)
+    feed = feed_from(list(Recording(path)), 2, 90, 0.004, latency_s)
     MjpegServer("left", feed, start, faults, port=ports[0])
     MjpegServer("right", feed, start, faults, port=ports[1])
     RtdeServer(feed, start, faults)
