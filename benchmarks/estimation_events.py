@@ -22,8 +22,8 @@ from estimation_trials import Trial, simulate
 from tiptrace.errors import SimulationError
 from tiptrace.estimation.full import FullConfig, FullEstimator
 from tiptrace.sim.conditions import CONDITIONS
-from tiptrace.sim.spec import FrictionDrop, Lift, Push, TrialSpec
-from tiptrace.types import Event, TipEstimate
+from tiptrace.sim.spec import Dwell, FrictionDrop, Lift, Push, TrialSpec
+from tiptrace.types import Event, Phase, TipEstimate
 
 SLIP_DEG, SLIP_M, SLIP_WINDOW_S = 1.5, 0.5e-3, 0.5
 LOSS_S, TOLD_LOSS_S, TOLD_SLIP_S = 0.2, 0.3, 1.0
@@ -68,6 +68,13 @@ def spec(kind: str, seed: int, level: str) -> TrialSpec:
             Push(start_s=float(s), duration_s=0.5, force_n=(0.0, float(f), 0.0))
             for s, f in zip(starts, sides, strict=True)
         )
+    if kind == "reanchor":  # a slip on the first 40 mm, then a stop with an anchoring motion
+        s = float(rng.uniform(4.9, 5.5))
+        extra["friction_drops"] = (
+            FrictionDrop(start_s=s, duration_s=0.5, factor=float(rng.uniform(0.03, 0.1))),
+        )
+        extra["pushes"] = (Push(start_s=s, duration_s=0.5, force_n=(0.0, float(rng.uniform(1.0, 3.0)), 0.0)),)
+        extra["dwells"] = (Dwell(at_m=0.04, duration_s=5.0, anchoring=True),)
     return TrialSpec(
         trajectory=c.trajectory,
         tool=c.tool,
@@ -76,7 +83,7 @@ def spec(kind: str, seed: int, level: str) -> TrialSpec:
         level=level,
         mode="markers",
         seed=seed,
-        travel_m=0.14 if kind == "lift" else 0.12,
+        travel_m={"lift": 0.14, "slip": 0.12, "reanchor": 0.08}[kind],
         **extra,
     )
 
@@ -165,6 +172,35 @@ def match(
     score.false.update(e.kind for k, (e, _) in enumerate(events) if k not in used and e.kind == kind)
 
 
+def reanchoring(seeds: range, level: str, cache: Path | None, cached_only: bool) -> None:
+    """Error before and after the system anchors anew."""
+    for seed in seeds:
+        if cached_only and cache is not None and not (cache / f"reanchor-{level}-{seed}.pkl").exists():
+            continue
+        try:
+            t = trial("reanchor", seed, level, cache)
+        except SimulationError as error:
+            print(f"not simulated: reanchor {seed}: {error}", flush=True)
+            continue
+        estimates, events = run(t)
+        at = [told for e, told in events if e.kind == "re-anchored"]
+        rows = [e for e in estimates if e.p_B is not None and e.phase is Phase.RECONSTRUCTION]
+        stamps = np.array([e.stamp_ns for e in rows])
+        error = np.linalg.norm(np.stack([e.p_B for e in rows]) - t.truth.at(stamps), axis=1) * 1e3
+        if not at:
+            print(
+                f"{t.spec.name} {seed}: not anchored anew; error at the end {error[-30:-5].mean():.2f} mm",
+                flush=True,
+            )
+            continue
+        before, after = error[(stamps < at[0]) & (stamps > at[0] - 10**9)], error[stamps > at[-1] + 2 * 10**8]
+        print(
+            f"{t.spec.name} {seed}: {len(at)} times anew, error {np.nanmean(before):.2f} mm before, "
+            f"{np.nanmean(after):.2f} mm after",
+            flush=True,
+        )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", default="1000:1012")
@@ -174,6 +210,9 @@ def main() -> None:
     parser.add_argument("--cached-only", action="store_true")
     args = parser.parse_args()
     for kind in args.kinds.split(","):
+        if kind == "reanchor":
+            reanchoring(range(*map(int, args.seeds.split(":"))), args.level, args.cache, args.cached_only)
+            continue
         event, within, truth = (
             ("contact-lost", TOLD_LOSS_S, true_losses)
             if kind == "lift"

@@ -214,6 +214,41 @@ def test_a_marker_that_stays_away_is_told() -> None:
     assert list(found) == ["marker-lost"]
 
 
+def resting(seed: int) -> tuple[Synthetic, list[SensedPair]]:
+    """A tip that goes on resting under a turning hand for eight seconds after Stage I."""
+    trial = Synthetic(
+        seed=seed,
+        anchoring_s=12.0,
+        latency_s=0.05,
+        tip_offset_m=OFFSET,
+        shown=(0.9, 0.7),
+        pose_noise=(5e-5, 5e-4),
+    )
+    pairs = [
+        replace(p, phase=Phase.ANCHORING if k < 100 else Phase.RECONSTRUCTION)
+        for k, p in enumerate(trial.pairs())
+    ]
+    return trial, pairs
+
+
+def test_a_change_of_the_time_offset_is_told_and_followed() -> None:
+    _, pairs = resting(4)
+    late = 30_000_000
+    pairs = [p if k < 120 else replace(p, stamp_ns=p.stamp_ns - late) for k, p in enumerate(pairs)]
+    estimator = FullEstimator()
+    run(estimator, pairs)
+    assert next(e.kind for e in estimator.events) == "latency-changed"
+    assert estimator.anchoring is not None
+    assert estimator.anchoring.tip_map.latency_s == pytest.approx(0.02, abs=8e-3)
+
+
+def test_an_unchanged_time_offset_is_not() -> None:
+    _, pairs = resting(5)
+    estimator = FullEstimator()
+    run(estimator, pairs)
+    assert "latency-changed" not in [e.kind for e in estimator.events]
+
+
 def test_a_gap_in_the_poses_is_told() -> None:
     trial = Synthetic(seed=9)
     pairs = trial.pairs()
@@ -236,4 +271,5 @@ def test_cost_per_frame_does_not_grow() -> None:
     estimator = FullEstimator(rig=rig())
     run(estimator, trial.pairs())
     assert len(estimator._track) < 1000
-    assert len(estimator._reanchoring._rows) == 0
+    assert len(estimator._reanchoring._rows) < 100
+    assert len(estimator._reanchoring._segment) < 100

@@ -97,6 +97,8 @@ class FullEstimator:
         self._anchor: Anchor | None = None
         self._refused = self._relative = False
         self._first: Tip | None = None  # first contact, for displacements
+        self._in_grasp = (0.0, 0)  # sum of squares of the tip's way against the hand, frames
+        self._closure_m: float | None = None
         self._rate = _Rate()
         self.events: list[Event] = []
         self._log = EventLog(self.events)
@@ -111,7 +113,11 @@ class FullEstimator:
     @property
     def anchor(self) -> Anchor | None:
         """Stage I result; None before it is solved, where it was refused, and for displacements."""
-        return self._anchor
+        if self._anchor is None or self._anchor.checks is None or not self._in_grasp[1]:
+            return self._anchor
+        rms = float(np.sqrt(self._in_grasp[0] / self._in_grasp[1]))
+        checks = replace(self._anchor.checks, in_grasp_m=rms, closure_m=self._closure_m)
+        return replace(self._anchor, checks=checks)
 
     @property
     def anchoring(self) -> Anchoring | None:
@@ -216,7 +222,9 @@ class FullEstimator:
                 advice(weak, covariance, anchoring.tool_rotations, limit),
             )
             return
-        self._anchor = Anchor(tip_map.p, covariance, tip_map.residual_m, tip_map.frames)
+        self._anchor = Anchor(
+            tip_map.p, covariance, tip_map.residual_m, tip_map.frames, checks=tip_map.checks
+        )
 
     # --- Stage II -------------------------------------------------------------------------------------------
 
@@ -265,6 +273,7 @@ class FullEstimator:
         v = self._rate.update(
             stamp_ns, hand.T_B_E[0, :3, :3] @ tip.moved_E
         )  # in-grasp part of the tip's velocity
+        self._in_grasp = (self._in_grasp[0] + float(tip.moved_E @ tip.moved_E), self._in_grasp[1] + 1)
         late = a.tip_map.covariance[15, 15] * np.outer(v, v)
         return replace(tip, covariance=tip.covariance + late)
 
@@ -294,17 +303,30 @@ class FullEstimator:
     def _try_reanchoring(
         self, pair: SensedPair, markers: PadMarkers, p_B: FloatArray, R_B_E: FloatArray
     ) -> None:
-        """After a slip: when the tip rests again while the hand turns, anchor anew."""
+        """When the tip rests again while the hand turns, anchor anew: after a slip, or where it helps."""
         assert self._anchoring is not None
-        if not self._verdict.slipped or self._relative:
+        if self._relative:
             return
         renewed = self._reanchoring.update(pair, markers, p_B, R_B_E, self._anchoring.tip_map)
-        if renewed is None or weak_axes(renewed.tip_map.covariance[P, P], self._config.refuse_sigma_m):
+        if renewed is None:
             return
-        self._anchoring, self._last_motion = renewed, None
+        tip_map = renewed.anchoring.tip_map
+        if renewed.latency_change_s is not None:
+            self._anchoring = self._anchoring.with_latency(tip_map)
+            detail = f"images are {renewed.latency_change_s * 1e3:+.0f} ms later against the robot's poses than before"
+            self._log.note("latency-changed", pair.stamp_ns, pair.stamp_ns, detail)
+        variance, limit = tip_map.covariance[P, P], self._config.refuse_sigma_m
+        better = np.trace(variance) < np.trace(self._anchoring.tip_map.covariance[P, P])
+        if weak_axes(variance, limit) or not (self._verdict.slipped or better):
+            return
+        self._anchoring, self._last_motion = renewed.anchoring, None
         self._verdict.slipped = False
-        sigma = np.sqrt(np.linalg.eigvalsh(renewed.tip_map.covariance[P, P])[-1]) * 1e3
-        detail = f"the tip rested while the hand turned: anchored anew, to {sigma:.1f} mm"
+        self._closure_m = max(self._closure_m or 0.0, renewed.off_m)
+        sigma = np.sqrt(np.linalg.eigvalsh(variance)[-1]) * 1e3
+        detail = (
+            f"the tip rested while the hand turned: anchored anew, to {sigma:.1f} mm; "
+            f"the trace was {renewed.off_m * 1e3:.1f} mm off"
+        )
         self._log.note("re-anchored", pair.stamp_ns, pair.stamp_ns, detail)
 
     # --- shared ---------------------------------------------------------------------------------------------

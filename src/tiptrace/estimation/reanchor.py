@@ -1,4 +1,4 @@
-"""Anchoring anew in mid-trial: after a slip, when the tip rests again and the hand turns."""
+"""Anchoring anew in mid-trial, when the tip rests again and the hand turns: after a slip, or by the way."""
 
 from __future__ import annotations
 
@@ -25,6 +25,9 @@ class ReanchorConfig(BaseModel):
     spread_m: float = Field(default=8e-4, gt=0)  # of the estimate, slip error included, about its mean
     turn_rad: float = Field(default=0.08, gt=0)  # range of the hand's orientation within the window
     every: int = Field(default=12, ge=1)  # frames between attempts
+    latency_std_s: float = Field(default=0.02, gt=0)  # by which the time offset may have changed
+    latency_sigmas: float = Field(default=4.0, gt=0)  # a change beyond is told
+    latency_change_s: float = Field(default=0.010, gt=0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +35,21 @@ class _Row:
     stamp_ns: int
     p_B: FloatArray
     R_B_E: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Renewed:
+    """A new anchor.
+
+    Attributes:
+        anchoring: What the window gave.
+        off_m: How far off the trace was there.
+        latency_change_s: New latency less the old one where they differ for certain, else None.
+    """
+
+    anchoring: Anchoring
+    off_m: float
+    latency_change_s: float | None
 
 
 class Reanchoring:
@@ -45,7 +63,7 @@ class Reanchoring:
 
     def update(
         self, pair: SensedPair, markers: PadMarkers, p_B: FloatArray, R_B_E: FloatArray, known: TipMap
-    ) -> Anchoring | None:
+    ) -> Renewed | None:
         """Take a frame; a new anchor once the tip has rested long enough under a turning hand."""
         self._segment.add_poses(pair.poses)
         self._segment.add(pair.stamp_ns, markers)
@@ -59,12 +77,19 @@ class Reanchoring:
         if not complete or self._count % self._config.every or not self._rests():
             return None
         try:
-            anchoring = self._segment.solve((known.latency_s, 2e-3), None)
+            anchoring = self._segment.solve((known.latency_s, self._config.latency_std_s), None, known)
         except (GeometryError, np.linalg.LinAlgError):
             return None
+        off = np.median(np.stack([r.p_B for r in self._rows]), axis=0) - anchoring.tip_map.p
         self._segment, self._count = self._like.fresh(), 0
         self._rows.clear()
-        return anchoring
+        return Renewed(anchoring, float(np.linalg.norm(off)), self._latency_change(anchoring.tip_map, known))
+
+    def _latency_change(self, now: TipMap, before: TipMap) -> float | None:
+        change = now.latency_s - before.latency_s
+        sigma = float(np.sqrt(now.covariance[15, 15] + before.covariance[15, 15]))
+        certain = abs(change) > max(self._config.latency_sigmas * sigma, self._config.latency_change_s)
+        return change if certain and bool(now.learned[15]) else None
 
     def _rests(self) -> bool:
         p = np.stack([r.p_B for r in self._rows])

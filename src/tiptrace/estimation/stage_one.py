@@ -15,7 +15,7 @@ from tiptrace.estimation.motion import MotionConfig, Motions, TemplateFit
 from tiptrace.estimation.pads import PadMarkers
 from tiptrace.estimation.patch import PatchConfig, trust
 from tiptrace.estimation.pose_track import HandStates, smooth_at
-from tiptrace.estimation.tip_map import DRIFT, C, TipMap, TipMapConfig, assumed_tip_map, solve_tip_map
+from tiptrace.estimation.tip_map import DRIFT, TAU, C, TipMap, TipMapConfig, assumed_tip_map, solve_tip_map
 from tiptrace.geometry.transforms import skew
 from tiptrace.types import BoolArray, FloatArray, PoseSample
 
@@ -60,6 +60,14 @@ class Anchoring:
             self, tip_map=replace(self.tip_map, theta=theta, covariance=covariance), start_ns=stamp_ns
         )
 
+    def with_latency(self, other: TipMap) -> Anchoring:
+        """The same anchor with the time offset of another solve."""
+        theta, covariance = self.tip_map.theta.copy(), self.tip_map.covariance.copy()
+        theta[TAU] = other.latency_s
+        covariance[TAU, :] = covariance[:, TAU] = 0.0
+        covariance[TAU, TAU] = other.covariance[TAU, TAU]
+        return replace(self, tip_map=replace(self.tip_map, theta=theta, covariance=covariance))
+
     def phase(self, stamp_ns: float) -> float:
         """t/T_I − 1."""
         return (stamp_ns - self.start_ns) * 1e-9 / self.tip_map.duration_s - 1.0
@@ -96,11 +104,16 @@ class StageOne:
         """A frame of the segment."""
         if self._sum_S is None or self._seen is None:
             self._sum_S, self._seen = np.zeros_like(markers.x_S), np.zeros(len(markers.x_S))
-        seen = np.isfinite(markers.x_S[:, 0])
-        self._sum_S[seen] += markers.x_S[seen]
-        self._seen[seen] += 1
+        self._tally(markers, 1)
         self._frames.append((stamp_ns, markers))
-        self._count += 1
+
+    def _tally(self, markers: PadMarkers, sign: int) -> None:
+        assert self._sum_S is not None
+        assert self._seen is not None
+        seen = np.isfinite(markers.x_S[:, 0])
+        self._sum_S[seen] += sign * markers.x_S[seen]
+        self._seen[seen] += sign
+        self._count += sign
 
     def trust(self) -> FloatArray:
         """(N,) weight of every marker, from its mean place so far."""
@@ -119,8 +132,10 @@ class StageOne:
         M = _first_seen(np.stack([m.X for m in head]))
         return TemplateFit(M, head[0].pad, head[0].axes, self.trust(), self._motion)
 
-    def solve(self, latency: tuple[float, float] | None, prior: TipPrior | None) -> Anchoring:
-        """Template, motions and tip map of the segment.
+    def solve(
+        self, latency: tuple[float, float] | None, prior: TipPrior | None, known: TipMap | None = None
+    ) -> Anchoring:
+        """Template, motions and tip map of the segment; ``known`` is an earlier map of the same gels.
 
         Raises:
             GeometryError: too few frames, markers or poses.
@@ -141,7 +156,7 @@ class StageOne:
             return smooth_at(track, T, kept - latency_s * 1e9, self._half_s)
 
         tip_map = solve_tip_map(
-            motions, hand_at, phase, duration, self._tip_map, latency, prior, self._normal
+            motions, hand_at, phase, duration, self._tip_map, latency, prior, self._normal, known
         )
         ref = reference(fit, X, motions, tip_map.c, self._normal)
         hand = hand_at(tip_map.latency_s)
@@ -173,7 +188,7 @@ class StageOne:
     def keep_from(self, stamp_ns: int) -> None:
         """Forget frames and poses before an instant."""
         while self._frames and self._frames[0][0] < stamp_ns:
-            self._frames.popleft()
+            self._tally(self._frames.popleft()[1], -1)
         while self._poses and self._poses[0].stamp_ns < stamp_ns - 500_000_000:
             self._poses.popleft()
 

@@ -31,7 +31,7 @@ from tiptrace.estimation.tip_map_solver import (
 )
 from tiptrace.types import AnchorChecks, BoolArray, FloatArray
 
-__all__ = ["DRIFT", "C", "P", "TipMap", "TipMapConfig", "assumed_tip_map", "solve_tip_map"]
+__all__ = ["DRIFT", "TAU", "C", "P", "TipMap", "TipMapConfig", "assumed_tip_map", "solve_tip_map"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,6 +95,7 @@ def solve_tip_map(
     latency: tuple[float, float] | None = None,
     prior: TipPrior | None = None,
     normal_E: FloatArray | None = None,
+    known: TipMap | None = None,
 ) -> TipMap:
     """Tip, map, latency and drift from Stage I.
 
@@ -107,6 +108,7 @@ def solve_tip_map(
         latency: Calibrated (mean, std) in s, where there is one.
         prior: Known tip in F_E.
         normal_E: (3,) closing axis in F_E; None: x.
+        known: An earlier map of the same gels, for the prior of G.
 
     Raises:
         GeometryError: fewer than 3 frames.
@@ -114,6 +116,8 @@ def solve_tip_map(
     normal = np.array([1.0, 0.0, 0.0]) if normal_E is None else normal_E
     latency = latency or (config.latency_s, config.latency_std_s)
     solver = Solver(motions, hand_at, phase, config, latency, prior, normal)
+    if known is not None:
+        solver.expect_map(known.G, known.covariance[G_, G_])
     theta = solver.start()
     free = np.ones(SIZE, dtype=bool)
     free[DRIFT] = False

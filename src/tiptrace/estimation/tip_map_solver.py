@@ -23,6 +23,7 @@ C, P, G_, TAU, DRIFT = slice(0, 3), slice(3, 6), slice(6, 15), slice(15, 16), sl
 SIZE = 19
 I9 = np.eye(3).ravel()
 DIAGONAL = I9 > 0
+_MAP_CHANGE = 0.02  # of the map after a slip
 
 HandAt = Callable[[float], HandStates]
 """Latency in s → the hand at every frame's exposure."""
@@ -105,10 +106,19 @@ class Solver:
             config.drift_sigma_m**2 * (np.eye(3) - across) + config.drift_normal_sigma_m**2 * across
         )
         self._prior_N = np.zeros((SIZE, SIZE))
-        self._prior_N[6:, 6:] = np.linalg.inv(self._prior_P[6:, 6:])
+        self._weigh_priors()
         if prior is not None:
             self._mean[C] = prior.c
             self._prior_N[C, C] = np.linalg.inv(prior.covariance)
+
+    def _weigh_priors(self) -> None:
+        self._prior_N[6:, 6:] = np.linalg.inv(self._prior_P[6:, 6:])
+
+    def expect_map(self, G: FloatArray, covariance: FloatArray) -> None:
+        """Take G (3, 3) and its covariance (9, 9) from an earlier solve as the prior, a little widened."""
+        self._mean[G_] = G.ravel()
+        self._prior_P[G_, G_] = covariance + _MAP_CHANGE**2 * np.eye(9)
+        self._weigh_priors()
 
     def start(self) -> FloatArray:
         """Maximum likelihood with the gel taken at its word and the latency at its prior."""
@@ -127,7 +137,7 @@ class Solver:
 
     def map_is_absurd(self, solution: Solution) -> bool:
         """Whether the fit left its prior by more than four sigmas: the tip did not rest, or the map diverged."""
-        off = solution.theta[G_] - I9
+        off = solution.theta[G_] - self._mean[G_]
         return bool(off @ np.linalg.solve(self._prior_P[G_, G_], off) > 4.0**2 + 9.0)
 
     def moved(self, theta: FloatArray) -> FloatArray:
