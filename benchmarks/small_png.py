@@ -1,4 +1,4 @@
-"""Pictures for the documentation: PNG with a palette, a third of the size of full colour."""
+"""Pictures for the documentation: PNG with a palette, half the size of full colour."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def save_small(figure: Figure, path: Path, dpi: int = 100, colours: int = 160) -> None:
+def save_small(figure: Figure, path: Path, dpi: int = 100, colours: int = 256) -> None:
     """Write a figure as a PNG of at most so many colours."""
     from PIL import Image
 
@@ -18,5 +18,7 @@ def save_small(figure: Figure, path: Path, dpi: int = 100, colours: int = 160) -
     figure.savefig(buffer, format="png", dpi=dpi)
     path.parent.mkdir(parents=True, exist_ok=True)
     with Image.open(buffer) as image:
-        small = image.convert("RGB").quantize(colours, method=Image.Quantize.MEDIANCUT)
+        rgb = image.convert("RGB")
+        palette = rgb.quantize(colours, method=Image.Quantize.MEDIANCUT)
+        small = rgb.quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG)
     small.save(path, optimize=True)
