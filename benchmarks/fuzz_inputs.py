@@ -180,7 +180,9 @@ def warm_up(sound: Sound, folder: Path) -> None:
     import tiptrace.cli
     import tiptrace.reconstruction
     import tiptrace.streams.inspection  # noqa: F401
+    from tiptrace.perception.warm_up import warm_up as compile_loops
 
+    compile_loops()
     for name, argv in {
         "recording": ["reconstruct", str(sound.trial), "--no-report", "--out", str(folder / "a")],
         "bag": ["reconstruct", str(sound.bags[0]), *sound.foreign, "--no-report", "--out", str(folder / "b")],

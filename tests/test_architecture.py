@@ -34,6 +34,7 @@ MAY_IMPORT = {
     "export": BASE | {"batch_plan", "frames", "geometry", "outputs", "pipeline", "streams", "tracer"},
     "live": BASE
     | {"geometry", "drivers", "streams", "perception", "estimation", "tracer", "pipeline", "calibration"},
+    "ros": BASE | {"drivers", "geometry", "live", "pipeline", "streams"},
     "trial_plan": BASE | {"evaluation", "sim", "trial_runs"},
     "reconstruction": BASE
     | {"estimation", "evaluation", "geometry", "outputs", "pipeline", "streams", "tracer"}

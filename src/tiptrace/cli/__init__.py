@@ -26,10 +26,12 @@ from tiptrace.cli.live import live
 from tiptrace.cli.plan_anchor import plan_anchor
 from tiptrace.cli.reconstruct import reconstruct
 from tiptrace.cli.record import record
+from tiptrace.cli.ros2 import ros2
 from tiptrace.cli.setup import setup
 from tiptrace.cli.simulate import simulate
 from tiptrace.cli.surface import surface
 from tiptrace.cli.track import track
+from tiptrace.cli.view import view
 from tiptrace.errors import TipTraceError
 
 app = typer.Typer(
@@ -55,6 +57,8 @@ app.command()(setup)
 app.command()(doctor)
 app.command()(record)
 app.command()(live)
+app.command()(view)
+app.command()(ros2)
 app.command("plan-anchor")(plan_anchor)
 app.command("import-gel")(import_gel)
 calibrate.command("gel")(calibrate_gel)

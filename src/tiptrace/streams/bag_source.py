@@ -5,6 +5,7 @@ from __future__ import annotations
 import sqlite3
 import struct
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -115,11 +116,12 @@ def _errors() -> tuple[type[Exception], ...]:
     from rosbags.rosbag2 import ReaderError
     from rosbags.serde import SerdeError
 
-    try:
-        from apsw import Error as SqliteError  # newer rosbags read SQLite through it
-    except ImportError:
-        SqliteError = sqlite3.Error
-    return (AnyReaderError, ReaderError, SerdeError, SqliteError, *_DAMAGE)
+    sqlite: tuple[type[Exception], ...] = ()
+    with suppress(ImportError):  # newer rosbags read SQLite through it
+        from apsw import Error
+
+        sqlite = (Error,)
+    return (AnyReaderError, ReaderError, SerdeError, *sqlite, *_DAMAGE)
 
 
 def _line(error: Exception) -> str:

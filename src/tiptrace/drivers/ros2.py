@@ -1,0 +1,221 @@
+"""ROS 2 as a robot: poses, and perhaps openings and phase marks, from topics or TF. rclpy is imported here only."""
+
+from __future__ import annotations
+
+import importlib
+import threading
+from collections.abc import Callable
+from typing import Any
+from urllib.parse import parse_qs
+
+import numpy as np
+
+from tiptrace.drivers.base import Closing, DeviceHealth, PoseFrames, RobotSample, RobotTap, Wake
+from tiptrace.drivers.sample_queue import SampleQueue
+from tiptrace.drivers.timeline import NS, ClockMap, Timeline
+from tiptrace.errors import ConfigError, DeviceError, GeometryError
+from tiptrace.geometry.transforms import rotation_from_quaternion, transform
+from tiptrace.types import FloatArray, OpeningSample, Phase, PhaseSample, PoseSample
+
+_FIRST_POSE_S = 5.0
+_TF_PERIOD_S = 0.01
+_OPENING_MAX_M = 0.3
+_FORM = "ros2, ros2:/POSE_TOPIC, with ?phase=/TOPIC&opening=/TOPIC, or ros2:tf?base=base&end_effector=tool0"
+
+
+def load(name: str) -> Any:
+    """A module of ROS 2.
+
+    Raises:
+        DeviceError: it is not in this Python.
+    """
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        raise DeviceError(
+            f"{name} is not in this Python: run in a terminal after 'source /opt/ros/jazzy/setup.bash', or in a "
+            "RoboStack environment (docs/ros2.md)"
+        ) from None
+
+
+def stamp_ns(stamp: Any) -> int:
+    """``builtin_interfaces/Time`` → ns."""
+    return int(stamp.sec) * NS + int(stamp.nanosec)
+
+
+def pose_matrix(position: Any, orientation: Any) -> FloatArray | None:
+    """Position (m) and quaternion (xyzw) fields → (4, 4); None where they are no pose."""
+    t = np.array([position.x, position.y, position.z], dtype=np.float64)
+    q = np.array([orientation.x, orientation.y, orientation.z, orientation.w], dtype=np.float64)
+    if not (np.isfinite(t).all() and np.isfinite(q).all()):
+        return None
+    try:
+        return transform(rotation_from_quaternion(q), t)
+    except GeometryError:
+        return None
+
+
+class TfLookup:
+    """T_B_E by the newest transform of a chain, each time that one comes.
+
+    Args:
+        node: Its clock and subscriptions are used.
+        base: Frame B.
+        end_effector: Frame E.
+
+    Raises:
+        DeviceError: tf2_ros is not installed.
+    """
+
+    def __init__(self, node: Any, base: str, end_effector: str) -> None:
+        tf2_ros = load("tf2_ros")
+        self._time = load("rclpy.time").Time
+        self._error: Any = tf2_ros.TransformException
+        self._buffer: Any = tf2_ros.Buffer()
+        self._listener: Any = tf2_ros.TransformListener(self._buffer, node)
+        self._base, self._end_effector = base, end_effector
+
+    def newest(self) -> tuple[int, FloatArray] | None:
+        """Stamp (ns) and T_B_E; None where the chain is not complete."""
+        try:
+            found = self._buffer.lookup_transform(self._base, self._end_effector, self._time())
+        except self._error:
+            return None
+        T = pose_matrix(found.transform.translation, found.transform.rotation)
+        return None if T is None else (stamp_ns(found.header.stamp), T)
+
+
+class Ros2Robot(Closing):
+    """The end effector's pose as ROS 2 publishes it.
+
+    Args:
+        uri: ``ros2``, ``ros2:/ee_pose?phase=/trial/phase&opening=/gripper/opening``, or
+            ``ros2:tf?base=base&end_effector=tool0``.
+        timeline: The session's.
+
+    Raises:
+        ConfigError: an address that means nothing.
+        DeviceError: ROS 2 is not installed.
+    """
+
+    def __init__(self, uri: str, timeline: Timeline) -> None:
+        topic, _, query = uri.removeprefix("ros2").removeprefix(":").partition("?")
+        options = {key: values[0] for key, values in parse_qs(query).items()}
+        known = {"phase", "opening", "base", "end_effector"}
+        if set(options) - known or (topic and topic != "tf" and not topic.startswith("/")):
+            raise ConfigError(f"robot {uri!r}: expected {_FORM}")
+        self.name, self._topic, self._options = uri, topic or "/ee_pose", options
+        self._rclpy = load("rclpy")
+        self._timeline = timeline
+        self._queue = SampleQueue(uri, timeline)
+        self._clock = ClockMap()
+        self._base: str | None = options.get("base") if topic == "tf" else None
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._last_tf = -1
+
+    @property
+    def frames(self) -> PoseFrames:
+        """The frame that the messages name; what moves in it only TF can tell."""
+        return PoseFrames(self._base, self._options.get("end_effector") if self._topic == "tf" else None)
+
+    def start(self, wake: Wake, tap: RobotTap | None = None) -> None:
+        """Subscribe and wait for the first pose."""
+        self._queue.wake, self._queue.tap = wake, tap
+        context = self._rclpy.Context()
+        self._rclpy.init(context=context)
+        try:
+            node = self._rclpy.create_node("tiptrace_robot", context=context)
+            self._subscribe(node)
+        except DeviceError:
+            self._rclpy.shutdown(context=context)
+            raise
+        self._thread = threading.Thread(target=self._spin, args=(context, node), name="ros2", daemon=True)
+        self._thread.start()
+        if not self._queue.first.wait(_FIRST_POSE_S):
+            self.close()
+            raise DeviceError(
+                f"{self.name}: no pose within {_FIRST_POSE_S:g} s on {self._topic}: is it published "
+                "(ros2 topic hz), in the same ROS_DOMAIN_ID?"
+            )
+
+    def take(self) -> list[RobotSample]:
+        """Samples since the last call."""
+        return self._queue.take()
+
+    def health(self) -> DeviceHealth:
+        """State at this moment."""
+        return self._queue.health()
+
+    def close(self) -> None:
+        """Unsubscribe."""
+        self._stop.set()
+        if self._thread is not None:
+            self._thread.join(timeout=3.0)
+            self._thread = None
+
+    # --- the thread ----------------------------------------------------------------------------------------
+
+    def _subscribe(self, node: Any) -> None:
+        qos = load("rclpy.qos").qos_profile_sensor_data
+        if self._topic == "tf":
+            lookup = TfLookup(
+                node, self._options.get("base", "base"), self._options.get("end_effector", "tool0")
+            )
+            node.create_timer(_TF_PERIOD_S, lambda: self._on_tf(lookup))
+        else:
+            node.create_subscription(
+                load("geometry_msgs.msg").PoseStamped, self._topic, self._guarded(self._on_pose), qos
+            )
+        std = load("std_msgs.msg")
+        phase, opening = self._options.get("phase", "/trial/phase"), self._options.get("opening")
+        node.create_subscription(std.String, phase, self._guarded(self._on_phase), 10)
+        if opening is not None:
+            node.create_subscription(std.Float64, opening, self._guarded(self._on_opening), qos)
+
+    def _spin(self, context: Any, node: Any) -> None:
+        executor = load("rclpy.executors").SingleThreadedExecutor(context=context)
+        executor.add_node(node)
+        try:
+            while not self._stop.is_set() and context.ok():
+                executor.spin_once(timeout_sec=0.1)
+        except Exception as error:  # noqa: BLE001  a thread that dies must not do so silently
+            self._queue.fail(DeviceError(f"{self.name}: {error}"))
+        finally:
+            executor.shutdown()
+            node.destroy_node()
+            self._rclpy.shutdown(context=context)
+
+    def _guarded(self, take: Callable[[Any], None]) -> Callable[[Any], None]:
+        def guarded(message: Any) -> None:
+            try:
+                take(message)
+            except (ValueError, ArithmeticError):
+                self._queue.meter.fault("garbled")
+
+        return guarded
+
+    def _on_pose(self, message: Any) -> None:
+        self._base = message.header.frame_id or self._base
+        T = pose_matrix(message.pose.position, message.pose.orientation)
+        self._put_pose(stamp_ns(message.header.stamp), T)
+
+    def _on_tf(self, lookup: TfLookup) -> None:
+        found = lookup.newest()
+        if found is not None and found[0] != self._last_tf:
+            self._last_tf = found[0]
+            self._put_pose(*found)
+
+    def _put_pose(self, stamp: int, T_B_E: FloatArray | None) -> None:
+        if T_B_E is None:
+            self._queue.meter.fault("garbled")
+            return
+        self._queue.put(PoseSample(self._clock.stamp_ns(stamp, self._timeline.now_ns()), T_B_E))
+
+    def _on_phase(self, message: Any) -> None:
+        self._queue.put(PhaseSample(self._timeline.now_ns(), Phase(message.data)))
+
+    def _on_opening(self, message: Any) -> None:
+        if not 0.0 <= message.data <= _OPENING_MAX_M:
+            raise ValueError("opening")
+        self._queue.put(OpeningSample(self._timeline.now_ns(), float(message.data)))

@@ -1,0 +1,1 @@
+"""The ROS 2 node. rclpy is imported inside functions: the rest of the package never needs it."""
