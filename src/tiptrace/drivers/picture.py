@@ -16,7 +16,7 @@ from tiptrace.types import Image
 JPEG_QUALITY = 95
 _FLIP = {"horizontal": 1, "vertical": 0, "both": -1}
 _BLOCKS = (16, 12)  # of which the picture's means are compared, x and y
-_BLOCK_STEP = 40.0  # grey levels by which a block's mean may change between two frames
+_BLOCK_STEP = 15.0  # grey levels by which a block's mean may change between two frames
 _MANY_BLOCKS = 3
 
 
