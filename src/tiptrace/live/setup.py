@@ -31,6 +31,7 @@ _REFERENCE_FRAMES = 20
 _STILL_LEVELS = 4.0  # spread of a pixel while nothing touches, median over the picture
 
 Say = Callable[[str], None]
+Pictures = dict[str, NDArray[np.float32]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,15 +103,16 @@ class Setup:
                 camera.start(lambda: None)
                 opened.append(Candidate(address, camera))
             found: dict[Side, str] = {}
+            calm = {c.address: _look(c) for c in opened}
             for side in SIDES:
                 self._say(f"touch the {side} gel with a finger, and let go")
-                found[side] = _wait_for_touch(opened, timeout_s)
+                found[side] = _wait_for_touch(opened, calm, timeout_s)
                 if side == "right" and found["left"] == found["right"]:
                     raise DeviceError(
                         f"both touches were seen by {found['left']}: touch one gel at a time, and start again"
                     )
                 self._say(f"{side}: {found[side]}")
-                _wait_for_calm(opened, timeout_s)
+                _wait_for_calm(opened, calm, timeout_s)
             return found
         finally:
             for candidate in opened:
@@ -209,56 +211,54 @@ def make_reference(side: Side, frames: list[Image]) -> Image:
     return image
 
 
-def _wait_for_touch(cameras: list[Candidate], timeout_s: float) -> str:
+def _wait_for_touch(cameras: list[Candidate], calm: Pictures, timeout_s: float) -> str:
     """Address of the camera whose picture changes, clearly more than all others'.
 
     Raises:
         DeviceError: none in time.
     """
-    calm = {c.address: _look(c, None) for c in cameras}
     end = time.monotonic() + timeout_s
     while time.monotonic() < end:
-        time.sleep(0.05)
-        change = {}
-        for c in cameras:
-            now = _look(c, calm[c.address])
-            change[c.address] = _change(now, calm[c.address])
+        change = _changes(cameras, calm)
         order = sorted(change, key=lambda address: -change[address])
         if change[order[0]] > _TOUCH_LEVELS and change[order[0]] > _TIMES_OTHER * change[order[1]]:
             return order[0]
     raise DeviceError(f"no touch was seen within {timeout_s:g} s: press the gel firmly, and start again")
 
 
-def _wait_for_calm(cameras: list[Candidate], timeout_s: float) -> None:
-    """Until no picture changes for half a second.
+def _wait_for_calm(cameras: list[Candidate], calm: Pictures, timeout_s: float) -> None:
+    """Until the pictures have been for half a second what they were before any touch.
 
     Raises:
-        DeviceError: they go on changing.
+        DeviceError: they do not come back.
     """
-    end, calm_since = time.monotonic() + timeout_s, time.monotonic()
-    last = {c.address: _look(c, None) for c in cameras}
+    end, since = time.monotonic() + timeout_s, time.monotonic()
     while time.monotonic() < end:
-        time.sleep(0.1)
-        for c in cameras:
-            now = _look(c, last[c.address])
-            if _change(now, last[c.address]) > 0.5 * _TOUCH_LEVELS:
-                calm_since = time.monotonic()
-            last[c.address] = now
-        if time.monotonic() - calm_since > 0.5:
+        if max(_changes(cameras, calm).values()) > 0.5 * _TOUCH_LEVELS:
+            since = time.monotonic()
+        if time.monotonic() - since > 0.5:
             return
     raise DeviceError(
-        "the pictures go on changing: let go of the gels, keep the lamps steady, and start again"
+        "the pictures do not come back to what they were: let go of the gels, keep the lamps steady, and start again"
     )
 
 
-def _look(candidate: Candidate, otherwise: NDArray[np.float32] | None) -> NDArray[np.float32]:
-    """The camera's newest picture, waited for where there is no older one to go on with."""
+def _changes(cameras: list[Candidate], calm: Pictures) -> dict[str, float]:
+    """Mean change over the busiest tenth of each camera's newest picture, grey levels."""
+    time.sleep(0.05)
+    return {c.address: _change(_look(c), calm[c.address]) for c in cameras}
+
+
+def _look(candidate: Candidate) -> NDArray[np.float32]:
+    """The camera's newest picture.
+
+    Raises:
+        DeviceError: there is none for two seconds.
+    """
     for _ in range(100):
         frames = candidate.camera.take()
         if frames:
             return cv2.GaussianBlur(frames[-1].image, (0, 0), 1.0).astype(np.float32)
-        if otherwise is not None:
-            return otherwise
         time.sleep(0.02)
     raise DeviceError(f"{candidate.address}: sends no new pictures: check its cable")
 
