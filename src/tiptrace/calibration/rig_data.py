@@ -11,7 +11,8 @@ from tiptrace.estimation.pose_track import HandStates, smooth_at
 from tiptrace.geometry.transforms import rotation_log
 from tiptrace.types import SIDES, BoolArray, FloatArray, IntArray, Observation, PoseSample, SensedPair, Side
 
-HALF_WIDTH_S = 0.05  # poses are smoothed over this before they are interpolated
+_HALF_WIDTHS_S = (0.05, 0.15)  # poses are smoothed over this before they are interpolated; see _half_width
+_SLOWLY = 0.35  # phase of the wiggle that one half width spans: a quadratic follows that to 0.02 %
 _MOST_FRAMES = 500  # more are thinned out evenly
 _FEWEST_FRAMES, _FEWEST_CORE = 50, 6
 _CORE = 0.75  # share of the deep markers' indentation from which a marker rides on the rod
@@ -49,12 +50,14 @@ class HandTrack:
         T_B_E: (K, 4, 4).
         sigma_m: Noise of a pose's position per axis, after smoothing.
         sigma_rad: Noise of its orientation per axis, after smoothing.
+        half_s: Half width of the smoothing.
     """
 
     stamps_ns: FloatArray
     T_B_E: FloatArray
     sigma_m: float
     sigma_rad: float
+    half_s: float
 
     @classmethod
     def of(cls, poses: list[PoseSample]) -> HandTrack:
@@ -71,21 +74,37 @@ class HandTrack:
             raise CalibrationError(
                 f"the recording has {len(stamps)} end-effector poses, too few to calibrate"
             )
-        smooth = smooth_at(stamps, T, stamps, HALF_WIDTH_S).T_B_E
-        own, left = _shares(float(np.median(np.diff(stamps))) * 1e-9)
+        half_s = _half_width(stamps, T)
+        smooth = smooth_at(stamps, T, stamps, half_s).T_B_E
+        own, left = _shares(float(np.median(np.diff(stamps))) * 1e-9, half_s)
         moved = (T[:, :3, 3] - smooth[:, :3, 3])[5:-5]
         turned = rotation_log(np.swapaxes(smooth[:, :3, :3], 1, 2) @ T[:, :3, :3])[5:-5]
         scale = np.sqrt(left / max(1.0 - 2.0 * own + left, 1e-6))
-        return cls(stamps, T, max(_spread(moved) * scale, 1e-7), max(_spread(turned) * scale, 1e-7))
+        return cls(stamps, T, max(_spread(moved) * scale, 1e-7), max(_spread(turned) * scale, 1e-7), half_s)
 
     def at(self, stamps_ns: FloatArray) -> HandStates:
         """Smoothed hand at instants (T,), ns."""
-        return smooth_at(self.stamps_ns, self.T_B_E, stamps_ns, HALF_WIDTH_S)
+        return smooth_at(self.stamps_ns, self.T_B_E, stamps_ns, self.half_s)
 
 
-def _shares(spacing_s: float) -> tuple[float, float]:
+def _half_width(stamps_ns: FloatArray, T_B_E: FloatArray) -> float:
+    """Half width of the smoothing, s: as wide as the wiggle is slow.
+
+    What is left of the noise after smoothing depends a little on where between two samples it is read. All exposures
+    lie alike between samples, so that a latency found by the best fit is drawn to where the noise is least: by up to
+    7 ms with 0.05 s, by about 1 ms with 0.15 s.
+    """
+    least, most = _HALF_WIDTHS_S
+    states = smooth_at(stamps_ns, T_B_E, stamps_ns[:: max(1, len(stamps_ns) // 500)], least)
+    turned = rotation_log(states.T_B_E[0, :3, :3].T @ states.T_B_E[:, :3, :3])
+    spread = np.sqrt(np.mean(np.var(turned, axis=0)))
+    rate = np.sqrt(np.mean(np.var(states.rate_E, axis=0)))
+    return float(np.clip(_SLOWLY * spread / max(rate, 1e-9), least, most))
+
+
+def _shares(spacing_s: float, half_s: float) -> tuple[float, float]:
     """Weight of a sample in its own smoothed value, and the smoothed value's variance over the sample's."""
-    half = max(HALF_WIDTH_S, 2.5 * spacing_s)
+    half = max(half_s, 2.5 * spacing_s)
     n = int(np.ceil(half / spacing_s))
     x = np.arange(-n, n + 1) * spacing_s / half
     weight = np.clip(1.0 - x * x, 1e-6, None)

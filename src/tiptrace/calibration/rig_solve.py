@@ -28,7 +28,7 @@ _PRIOR = np.array(
     [*[0.35] * 3, *[0.02] * 3, 0.1, 0.1, 0.5, 0.5, 0.7, 0.3]
 )  # so that a weak axis stays finite
 _STEP = np.array([*[1e-5] * 3, *[1e-6] * 3, *[1e-5] * 5, 1e-4])
-_TILT_RAD, _OFFSET_M = 0.02, 3e-5  # slow changes of a pad's depth map
+_TILT_RAD, _OFFSET_M = 0.1, 1e-4  # slow changes of a pad's depth map; wide, since neighbours say the same
 _SIGMA_M = (3e-5, 1.2e-4)  # first guess of the markers' noise, along the gel and across it
 _HUBER, _ROUNDS, _CONVERGED = 2.5, 12, 0.02  # the last: of a sigma
 
