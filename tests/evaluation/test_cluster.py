@@ -58,3 +58,13 @@ def test_a_cluster_gives_the_same_numbers_with_a_worker_killed(cluster: Any, tmp
 def test_a_scheduler_that_is_not_there_is_one_sentence():
     with pytest.raises(ConfigError, match="no Dask scheduler answers"), dask_executor("tcp://127.0.0.1:1"):
         pass
+
+
+def test_a_scheduler_without_workers_is_not_waited_for_for_ever():
+    options = {"n_workers": 0, "dashboard_address": None}
+    with (
+        distributed.LocalCluster(**options) as empty,
+        pytest.raises(ConfigError, match="had no worker for 0.5 s"),
+        dask_executor(empty.scheduler_address, workers_s=0.5),
+    ):
+        pass

@@ -12,17 +12,20 @@ import cv2
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+import yaml
 
-from tiptrace.errors import ConfigError, OutputError
+from tiptrace.errors import ConfigError, OutputError, RecordingError
 from tiptrace.export.dataset import LeRobotOptions, export_dataset
-from tiptrace.export.episodes import Episode, Source, find_sources, load_episode
+from tiptrace.export.episodes import Episode, Source, find_sources, load_episode, traced_episode
 from tiptrace.export.images import EncodedImages
-from tiptrace.export.lerobot_format import Feature, pooled, stats_of
+from tiptrace.export.lerobot_annotate import annotate
+from tiptrace.export.lerobot_format import PHASE, TIP_FEATURES, Feature, pooled, stats_of
+from tiptrace.export.lerobot_reader import open_lerobot
 from tiptrace.export.lerobot_writer import LikeTheFirst, write_lerobot
 from tiptrace.sim.spec import make_spec
 from tiptrace.streams.simulated import SimulatedStream
 from tiptrace.streams.writer import write_recording
-from tiptrace.types import Side, Status, TipEstimate
+from tiptrace.types import SIDES, Side, Status, TipEstimate
 
 SHORT = {"mode": "markers", "travel_m": 0.011, "fps": 25.0, "anchoring_s": 1.4}
 READER = Path(__file__).with_name("lerobot_read.py")
@@ -116,6 +119,78 @@ def test_an_episode_unlike_the_first_is_refused():
 def test_an_unknown_version_is_refused_before_anything_is_traced(recordings: Path, tmp_path: Path):
     with pytest.raises(ConfigError, match=r"v3\.0, v2\.1"):
         export_dataset(sources_of(recordings), "lerobot", tmp_path / "x", lerobot=LeRobotOptions("v1.6"))
+
+
+@pytest.fixture(scope="module")
+def pictured(tmp_path_factory: pytest.TempPathFactory) -> tuple[Episode, Path]:
+    """A short trial with images, and a folder with its rig file and references."""
+    settings = {
+        "travel_m": 0.004,
+        "fps": 10.0,
+        "anchoring_s": 1.6,
+        "mode": "images",
+        "level": "clean",
+        "seed": 5,
+    }
+    stream = SimulatedStream(make_spec(**settings))
+    episode = traced_episode("x", stream, "paper", images=True)
+    folder = tmp_path_factory.mktemp("rig")
+    (folder / "rig.yaml").write_text(yaml.safe_dump(stream.rig.model_dump(mode="json", exclude_none=True)))
+    for side, image in stream.references.items():
+        cv2.imwrite(str(folder / f"{side}.png"), image)
+    return episode, folder
+
+
+def theirs(folder: Path, episode: Episode, version: str = "v3.0", tactile: bool = True) -> Path:
+    """A dataset as others have it: poses and tactile images without any tip."""
+    write_lerobot(folder, [episode, episode], version)
+    info = json.loads((folder / "meta/info.json").read_text())
+    gone = [n for n in info["features"] if n.startswith("observation.tip.") and n != PHASE]
+    gone += [] if tactile else [n for n in info["features"] if "tactile" in n]
+    for file in (folder / "data").rglob("*.parquet"):
+        pq.write_table(pq.read_table(file).drop_columns(gone).replace_schema_metadata(None), file)
+    info["features"] = {n: f for n, f in info["features"].items() if n not in gone}
+    (folder / "meta/info.json").write_text(json.dumps(info))
+    return folder
+
+
+@pytest.mark.parametrize("version", ["v3.0", "v2.1"])
+def test_a_dataset_is_annotated_at_its_own_frames(
+    pictured: tuple[Episode, Path], tmp_path: Path, version: str
+):
+    episode, folder = pictured
+    root, rig = theirs(tmp_path / "theirs", episode, version), folder / "rig.yaml"
+    before = [pq.read_table(f) for f in sorted((root / "data").rglob("*.parquet"))]
+    untouched: dict[Side, Path] = {side: folder / f"{side}.png" for side in SIDES}
+    done = annotate(open_lerobot(root), tmp_path / "ours", rig, None, untouched, method="paper")
+    assert not done.failures
+    files = sorted((tmp_path / "ours/data").rglob("*.parquet"))
+    after = [pq.read_table(f) for f in files]
+    for old, new in zip(before, after, strict=True):
+        assert new.select(old.column_names).equals(old)
+    rows = [row for table in after for row in table.to_pylist()]
+    valid = np.array([r["observation.tip.valid"] for r in rows])
+    assert np.isfinite(episode.position).all(axis=1).sum() * 2 == pytest.approx(valid.sum(), abs=4)
+    position = np.array([r["observation.tip.position"] for r in rows])
+    assert len(rows) == json.loads((root / "meta/info.json").read_text())["total_frames"]
+    assert valid.mean() > 0.5
+    assert np.isfinite(position[valid]).all()
+    half = len(rows) // 2
+    np.testing.assert_array_equal(position[:half], position[half:])  # the same episode twice
+    assert set(TIP_FEATURES) <= set(json.loads((tmp_path / "ours/meta/info.json").read_text())["features"])
+    with pytest.raises(ConfigError, match="already"):
+        annotate(open_lerobot(tmp_path / "ours"), tmp_path / "again", rig)
+
+
+def test_a_dataset_without_tactile_images_is_refused_by_what_it_lacks(tmp_path: Path):
+    root = theirs(tmp_path / "a", made_up(5), tactile=False)
+    with pytest.raises(ConfigError, match="no tactile images of the left finger"):
+        open_lerobot(root)
+    with pytest.raises(ConfigError, match="end effector's pose"):
+        open_lerobot(theirs(tmp_path / "b", made_up(5, images=True)), {"pose": "action"})
+    (root / "meta/info.json").write_text("{}")
+    with pytest.raises(RecordingError, match="not a LeRobot dataset"):
+        open_lerobot(root)
 
 
 @pytest.mark.slow

@@ -14,6 +14,7 @@ from tiptrace.errors import ConfigError, MissingExtraError
 
 _ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 _CONNECT_S = 15.0
+_WORKERS_S = 300.0  # a SLURM queue may take its time; whoever waits longer starts the workers first
 
 OpenExecutor = Callable[[], Executor]
 
@@ -47,12 +48,16 @@ def local_executor(workers: int) -> OpenExecutor:
 
 
 @contextmanager
-def dask_executor(address: str) -> Iterator[OpenExecutor]:
+def dask_executor(address: str, workers_s: float = _WORKERS_S) -> Iterator[OpenExecutor]:
     """A Dask cluster behind the same interface; the cluster runs tasks of a dead worker again by itself.
+
+    Args:
+        address: Of the scheduler.
+        workers_s: How long to wait for the first worker, s.
 
     Raises:
         MissingExtraError: ``distributed`` is not installed.
-        ConfigError: no scheduler answers at the address.
+        ConfigError: no scheduler answers at the address, or it has no worker.
     """
     try:
         distributed: Any = import_module("distributed")
@@ -66,6 +71,13 @@ def dask_executor(address: str) -> Iterator[OpenExecutor]:
             "leave --scheduler out to use this machine"
         ) from None
     with client:
+        try:
+            client.wait_for_workers(1, timeout=workers_s)
+        except TimeoutError:
+            raise ConfigError(
+                f"the Dask scheduler at '{address}' had no worker for {workers_s:g} s; start some with "
+                f"`dask worker {address} --nthreads 1`"
+            ) from None
         client.run(_single_threaded)
         yield lambda: client.get_executor(pure=False, retries=2)
 
