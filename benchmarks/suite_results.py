@@ -5,8 +5,9 @@
     python benchmarks/suite_results.py gather evaluated --data docs/data/suite.parquet
     python benchmarks/suite_results.py page --data docs/data/suite.parquet --traces evaluated
 
-A folder is named LEVEL-SEED. ``evaluate`` continues where it was stopped. ``page`` writes the tables between the marks ``<!-- suite:begin -->`` and
-``<!-- suite:end -->`` of docs/results.md from the Parquet file alone; with ``--traces`` the overlays are drawn too.
+A folder is named LEVEL-SEED; ``evaluate`` continues where it was stopped. ``page`` writes the tables between the marks
+``<!-- suite:begin -->`` and ``<!-- suite:end -->`` of docs/results.md from the Parquet file alone; with ``--traces``
+the overlays are drawn too.
 """
 
 from __future__ import annotations

@@ -64,7 +64,7 @@ def test_a_scheduler_without_workers_is_not_waited_for_for_ever():
     options = {"n_workers": 0, "dashboard_address": None}
     with (
         distributed.LocalCluster(**options) as empty,
-        pytest.raises(ConfigError, match="had no worker for 0.5 s"),
+        pytest.raises(ConfigError, match="had no worker"),
         dask_executor(empty.scheduler_address, workers_s=0.5),
     ):
         pass
