@@ -21,6 +21,7 @@ from tiptrace.estimation.ee_only import EeOnlyEstimator
 from tiptrace.estimation.full import FullConfig, FullEstimator
 from tiptrace.estimation.paper import PaperEstimator
 from tiptrace.evaluation.metrics import TrialMetrics, evaluate
+from tiptrace.evaluation.quality import assess
 from tiptrace.types import TipTrajectory
 
 COLUMNS = ("initial_contact_error_mm", "trajectory_rmse_mm", "shape_rmse_mm", "cross_track_rmse_mm")
@@ -79,6 +80,8 @@ def main() -> None:
                 "usable": m.usable_fraction,
             }
             row |= {"name": spec.name, "seed": spec.seed, "nees": m.nees_median}
+            row["verdict"] = assess(trajectory).verdict
+            row["prior_mm"] = float(np.linalg.norm(t.nominal_error_m)) * 1e3
             row["events"] = ",".join(e.kind for e in trajectory.events)
             row["minutes"] = (t.pairs[-1].stamp_ns - t.pairs[0].stamp_ns) / 6e10
             rows[method].append(row)
@@ -109,9 +112,20 @@ def report(args: argparse.Namespace, rows: dict[str, list[dict[str, float | str]
             wins = np.mean([reference[r["seed"]] < r["cross_track_rmse_mm"] for r in curved])
             print(f"  full beats {method} in cross-track on {100 * wins:.1f} % of {len(curved)} trials T2-T5")
     if "full" in rows:
+        report_verdicts(rows["full"])
         told = [kind for r in rows["full"] for kind in str(r["events"]).split(",") if kind]
         minutes = sum(float(r["minutes"]) for r in rows["full"])
         print(f"  events of full: { ({k: told.count(k) for k in set(told)}) } in {minutes:.1f} minutes")
+
+
+def report_verdicts(rows: list[dict[str, float | str]]) -> None:
+    for verdict in ("pass", "warn", "fail"):
+        error = [float(r["trajectory_rmse_mm"]) for r in rows if r["verdict"] == verdict]
+        known = [e for e in error if np.isfinite(e)]
+        worst = f"median {np.median(known):.2f}, largest {max(known):.2f} mm" if known else ""
+        print(
+            f"  verdict {verdict}: {len(error)} trials, without a position {len(error) - len(known)}, {worst}"
+        )
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ import numpy as np
 from tiptrace.config import Rig, Tool
 from tiptrace.evaluation.truth import Truth
 from tiptrace.sim.conditions import CONDITIONS
+from tiptrace.sim.seeds import stream
 from tiptrace.sim.simulation import Frame
 from tiptrace.sim.spec import TrialSpec
 from tiptrace.streams.simulated import SimulatedStream
@@ -32,6 +33,12 @@ class Trial:
     exposure_ns: np.ndarray
     slip_deg: np.ndarray
     slip_m: np.ndarray
+
+    @property
+    def nominal_error_m(self) -> np.ndarray:
+        """(3,) error of the tip that the tool's file states, in F_E."""
+        sigma = self.spec.disturbed_by.nominal_tip_m
+        return np.asarray(sigma * stream(self.spec.seed, "nominal-tip").normal(size=3))
 
 
 @dataclass

@@ -19,6 +19,7 @@ _SERIOUS = {
     "contact-lost": "the tip left the surface",
     "left-right-disagreement": "the two fingers disagree",
     "pose-gap": "the robot's poses have a gap",
+    "latency-changed": "the time offset between images and poses changed",
 }
 
 
@@ -31,6 +32,18 @@ class QualityLimits(BaseModel):
     usable_fail: float = Field(default=0.5, ge=0, le=1)
     anchor_std_warn_mm: float = Field(default=3.0, gt=0)
     fit_residual_warn_mm: float = Field(default=0.5, gt=0)  # median of the rigid fit
+    held_out_warn_mm: float = Field(default=0.4, gt=0)  # Stage I frames predicted from the others
+    held_out_fail_mm: float = Field(default=0.75, gt=0)
+    halves_warn_sigma: float = Field(default=3.0, gt=0)  # anchors of Stage I's two halves
+    prior_warn_sigma: float = Field(default=3.0, gt=0)  # anchor against the tip of the tool's file
+    position_std_warn_mm: float = Field(default=1.0, gt=0)  # median along the weakest axis
+    in_grasp_warn_mm: float = Field(
+        default=12.0, gt=0
+    )  # way of the tip against the hand: more than gels give
+    closure_warn_mm: float = Field(default=1.0, gt=0)
+    returned_mm: float = Field(
+        default=3.0, gt=0
+    )  # a tip that ends so near its anchor, after travel, has returned
     degraded_warn: float = Field(default=0.1, ge=0, le=1)
 
 
@@ -43,7 +56,7 @@ class Quality:
 
 
 def assess(trajectory: TipTrajectory, limits: QualityLimits | None = None) -> Quality:
-    """Judge a trace by its completeness, its anchor, its fit and its events."""
+    """Judge a trace by its completeness, its anchor, its fit, its returns to known places and its events."""
     limits = limits or QualityLimits()
     rows = [e for e in trajectory.estimates if e.phase is Phase.RECONSTRUCTION]
     failures = _failures(trajectory, rows, limits)
@@ -52,8 +65,11 @@ def assess(trajectory: TipTrajectory, limits: QualityLimits | None = None) -> Qu
     doubts = [
         *_completeness(rows, limits),
         *_anchor(trajectory.anchor, limits),
+        *_stage_one(trajectory.anchor, limits),
+        *_closure(trajectory.anchor, rows, limits),
         *_fit(rows, limits),
         *_events(trajectory.events),
+        *_uncertainty(trajectory.anchor, rows, limits),
     ]
     return Quality("warn" if doubts else "pass", tuple(doubts))
 
@@ -70,6 +86,12 @@ def _failures(trajectory: TipTrajectory, rows: list[TipEstimate], limits: Qualit
     if usable < limits.usable_fail:
         counts = Counter(e.status.value for e in rows if e.p_B is None)
         return [f"only {usable:.0%} of the reconstruction pairs have a position ({_listed(counts)})"]
+    checks = trajectory.anchor.checks if trajectory.anchor is not None else None
+    if checks is not None and checks.held_out_m * 1e3 > limits.held_out_fail_mm:
+        return [
+            f"the anchoring motion does not fit a resting tip: frames predicted from the others are "
+            f"{checks.held_out_m * 1e3:.2f} mm off; anchor again"
+        ]
     return []
 
 
@@ -90,15 +112,77 @@ def _anchor(anchor: Anchor | None, limits: QualityLimits) -> list[str]:
     if anchor is None:
         return []
     doubts = []
-    if anchor.covariance is not None:
-        std_mm = float(np.sqrt(max(0.0, np.linalg.eigvalsh(anchor.covariance)[-1]))) * 1e3
-        if std_mm > limits.anchor_std_warn_mm:
-            doubts.append(f"the anchor is uncertain by {std_mm:.1f} mm along its weakest axis")
+    if (std_mm := _anchor_std_mm(anchor)) > limits.anchor_std_warn_mm:
+        doubts.append(f"the anchor is uncertain by {std_mm:.1f} mm along its weakest axis")
     doubts += [
         f"the anchoring motion says little about the tip along ({x:+.2f}, {y:+.2f}, {z:+.2f})"
         for x, y, z in anchor.weak_axes
     ]
     return doubts
+
+
+def _anchor_std_mm(anchor: Anchor | None) -> float:
+    """Standard deviation along the anchor's weakest axis; 0 where nothing is said of it."""
+    if anchor is None or anchor.covariance is None:
+        return 0.0
+    return float(np.sqrt(max(0.0, np.linalg.eigvalsh(anchor.covariance)[-1]))) * 1e3
+
+
+def _stage_one(anchor: Anchor | None, limits: QualityLimits) -> list[str]:
+    """Stage I against itself, and against what was known beforehand."""
+    if anchor is None or anchor.checks is None:
+        return []
+    c, doubts = anchor.checks, []
+    if c.held_out_m * 1e3 > limits.held_out_warn_mm:
+        doubts.append(f"Stage I frames predicted from the others are {c.held_out_m * 1e3:.2f} mm off")
+    if c.halves_sigma > limits.halves_warn_sigma:
+        doubts.append(
+            f"the anchors of Stage I's two halves are {c.halves_m * 1e3:.1f} mm apart, "
+            f"{c.halves_sigma:.1f} times what is to be expected"
+        )
+    if c.prior_sigma is not None and c.prior_sigma > limits.prior_warn_sigma:
+        doubts.append(f"the anchor is {c.prior_sigma:.1f} standard deviations off the tip of the tool's file")
+    if c.in_grasp_m is not None and c.in_grasp_m * 1e3 > limits.in_grasp_warn_mm:
+        doubts.append(
+            f"the tip is {c.in_grasp_m * 1e3:.0f} mm from where the end effector alone would have it"
+        )
+    return doubts
+
+
+def _closure(anchor: Anchor | None, rows: list[TipEstimate], limits: QualityLimits) -> list[str]:
+    """Where the tip came to a known place: anchored anew, or back at the anchor in the end."""
+    doubts = []
+    if anchor is not None and anchor.checks is not None and anchor.checks.closure_m is not None:
+        off_mm = anchor.checks.closure_m * 1e3
+        if off_mm > limits.closure_warn_mm:
+            doubts.append(f"the trace was {off_mm:.1f} mm off where the tip was anchored anew")
+    returned_mm = _returned_mm(anchor, rows, limits)
+    if returned_mm is not None and returned_mm > limits.closure_warn_mm:
+        doubts.append(f"the tip returned to its anchor, but the trace ends {returned_mm:.1f} mm from it")
+    return doubts
+
+
+def _returned_mm(anchor: Anchor | None, rows: list[TipEstimate], limits: QualityLimits) -> float | None:
+    """Distance of the trace's end from the anchor where the tip went away, came back and rested; else None."""
+    p = [e.p_B for e in rows if e.p_B is not None and e.status.value != "relative"]
+    if anchor is None or len(p) < 20:
+        return None
+    away_mm = np.linalg.norm(np.stack(p) - anchor.p_B, axis=1) * 1e3
+    end = np.stack(p[-10:])
+    rests = bool(np.linalg.norm(end - end.mean(axis=0), axis=1).max() * 1e3 < 0.3)
+    returned = away_mm[-10:].max() < limits.returned_mm and away_mm.max() > 5.0 * limits.returned_mm
+    return float(np.linalg.norm(end.mean(axis=0) - anchor.p_B)) * 1e3 if rests and returned else None
+
+
+def _uncertainty(anchor: Anchor | None, rows: list[TipEstimate], limits: QualityLimits) -> list[str]:
+    """What the covariances say, where the anchor has not been blamed already."""
+    C = [e.covariance for e in rows if e.covariance is not None and e.status.value != "relative"]
+    if not C or _anchor_std_mm(anchor) > limits.anchor_std_warn_mm:
+        return []
+    std_mm = float(np.sqrt(np.median(np.linalg.eigvalsh(np.stack(C))[:, -1]))) * 1e3
+    if std_mm > limits.position_std_warn_mm:
+        return [f"positions are uncertain by {std_mm:.1f} mm along their weakest axis"]
+    return []
 
 
 def _fit(rows: list[TipEstimate], limits: QualityLimits) -> list[str]:
