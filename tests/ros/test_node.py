@@ -68,7 +68,7 @@ def answers(trial: Path) -> dict:
         "--",
         "--ros-args",
     ]
-    options = ("use_sim_time:=true", "reliable:=true", "queue_depth:=1000")
+    options = ("use_sim_time:=true", "reliable:=true", "queue_depth:=1000", "wait_for_late_s:=0.25")
     command += [part for option in options for part in ("-p", option)]
     out = trial.with_name("answers.json")
     with trial.with_name("node.txt").open("wb") as said:
@@ -90,7 +90,8 @@ def test_the_node_s_estimate_is_the_offline_one(trial: Path, answers: dict) -> N
     expected = {e.stamp_ns: e for e in offline.estimates if e.p_B is not None}
     found = {row[0]: np.array(row[2:]) for row in answers["tip"]}
     assert set(found) <= set(expected)
-    assert len(found) >= 0.98 * len(expected)  # the last pairs wait for poses that do not come any more
+    # as offline, late samples are waited for: at the end of the stream the last quarter second still is
+    assert len(found) >= 0.93 * len(expected)
     worst_m = max(float(np.abs(found[t] - expected[t].p_B).max()) for t in found)
     assert worst_m < 1e-6
     covariances = {row[0]: np.array(row[1:]).reshape(6, 6)[:3, :3] for row in answers["pose"]}
