@@ -8,10 +8,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import typer
 
+from tiptrace.cli.calibrate_check import calibrate_check
+from tiptrace.cli.calibrate_gel import calibrate_gel
 from tiptrace.cli.depth import depth
 from tiptrace.cli.track import track
-from tiptrace.errors import PerceptionError
+from tiptrace.errors import CalibrationError, OutputError, PerceptionError
 from tiptrace.sim.dots import DotLayout
 from tiptrace.sim.gel import untouched
 from tiptrace.sim.optics import gel_optics
@@ -46,6 +49,51 @@ def test_track_writes_a_row_per_marker_and_frame_under_fixed_numbers(
     places = np.array([[float(r["u_px"]), float(r["v_px"])] for r in rows]).reshape(5, 63, 2)
     assert np.abs(places - places[0]).max() < 0.3  # a still gel
     assert cv2.VideoCapture(str(tmp_path / "tracks.mp4")).read()[0]
+
+
+def test_patch_is_a_column_of_its_own(video: Path, tmp_path: Path) -> None:
+    track(video, out=tmp_path / "tracks.csv", patch=True)
+    with (tmp_path / "tracks.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert {row["patch"] for row in rows} == {"1"}  # a still gel: nothing can be said, every marker counts
+
+
+def test_outputs_that_cannot_be_written_are_told_before_the_work(video: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match=r"tracks\.csv: cannot be written"):
+        track(video, out=tmp_path / "file" / "tracks.csv")
+    with pytest.raises(OutputError, match=r"gel\.onnx: cannot be written"):
+        calibrate_gel(tmp_path, out=tmp_path / "file" / "gel.onnx")
+    assert (tmp_path / "file").read_text() == ""
+
+
+def test_depth_takes_the_scale_of_the_gel_model(renderer: TactileRenderer, tmp_path: Path) -> None:
+    press = render_press(renderer, (160.0, 120.0), ball_diameter_m=6e-3, depth_m=0.6e-3)
+    cv2.imwrite(str(tmp_path / "press.png"), press.image)
+    cv2.imwrite(str(tmp_path / "reference.png"), renderer.reference())
+    maps = []
+    for scale in (None, 0.0625, 0.125):
+        depth(
+            tmp_path / "press.png",
+            reference=tmp_path / "reference.png",
+            gel="gelsight-mini-virtual",
+            mm_per_px=scale,
+            out=tmp_path,
+        )
+        maps.append(np.load(tmp_path / "depth.npy"))
+    assert np.array_equal(maps[0], maps[1])
+    assert maps[2].max() == pytest.approx(2 * maps[0].max(), rel=0.05)
+
+
+def test_check_says_what_is_missing_and_fails_on_wear(renderer: TactileRenderer, tmp_path: Path) -> None:
+    reference, dim = tmp_path / "reference.png", tmp_path / "dim.png"
+    cv2.imwrite(str(reference), renderer.reference())
+    cv2.imwrite(str(dim), (renderer.reference() * 0.7).astype(np.uint8))
+    with pytest.raises(CalibrationError, match="no image of the untouched gel; give --reference"):
+        calibrate_check([dim], gel="gelsight-mini-virtual")
+    calibrate_check([reference], reference=reference, gel="gelsight-mini-virtual")
+    with pytest.raises(typer.Exit):
+        calibrate_check([dim], reference=reference, gel="gelsight-mini-virtual")
 
 
 def test_a_video_without_markers_or_no_video_is_refused(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from tiptrace.calibration.gel_circles import (
     in_one_place,
     locate,
 )
-from tiptrace.calibration.gel_data import Circle, PressFolder, check_rig, read_press_folder
+from tiptrace.calibration.gel_data import Circle, Press, PressFolder, check_rig, read_press_folder
 from tiptrace.calibration.gel_evaluation import PressScore, measured_slopes, score_press
 from tiptrace.calibration.gel_network import HIDDEN, Progress, train_network
 from tiptrace.calibration.gel_onnx import mlp_to_onnx
@@ -105,9 +105,7 @@ def train_gel(
         check_rig(data, sensor)
     tell("finding the contacts", 0.0)
     rng = np.random.default_rng(seed)
-    shuffled = rng.permutation(len(data.presses)).tolist()
-    n_test = max(len(data.presses) // _HELD_OUT, 1)
-    test, train = sorted(shuffled[:n_test]), sorted(shuffled[n_test:])
+    test, train = _split(len(data.presses), rng)
     training = replace(data, presses=tuple(data.presses[i] for i in train))
     found = find_circles(training)
     one_place = in_one_place(found, data)
@@ -119,11 +117,10 @@ def train_gel(
     metadata = _metadata(data, valid, shading) | {"one_place": "yes" if one_place else "no"}
     out.write_bytes(mlp_to_onnx(network.weights, network.biases, convention, metadata=metadata))
     gel = GelModel(out.read_bytes(), str(out))
-    scores = tuple(score_press(gel, data.presses[i], c, data) for i, c in zip(test, held_out, strict=True))
+    tested = [data.presses[i] for i in test]
+    scores = tuple(score_press(gel, p, c, data) for p, c in zip(tested, held_out, strict=True))
     if pictures is not None:
-        pictures.mkdir(parents=True, exist_ok=True)
-        for i, score in zip(test, scores, strict=True):
-            draw_press(score, data.presses[i], data, pictures / f"{Path(score.name).stem}.png")
+        _draw(scores, tested, data, pictures)
     flat = measured_slopes(gel, data.reference, data.background, data.presses[0].dots)
     pitch = data.marker_pitch_px
     return GelTrainingReport(
@@ -144,6 +141,19 @@ def train_gel(
         circles={data.presses[i].name: c for i, c in zip(train + test, found + held_out, strict=True)},
         seconds=time.perf_counter() - start,
     )
+
+
+def _split(n: int, rng: np.random.Generator) -> tuple[list[int], list[int]]:
+    """Indices of the held-out presses and of the others."""
+    shuffled = rng.permutation(n).tolist()
+    held_out = max(n // _HELD_OUT, 1)
+    return sorted(shuffled[:held_out]), sorted(shuffled[held_out:])
+
+
+def _draw(scores: tuple[PressScore, ...], presses: list[Press], data: PressFolder, where: Path) -> None:
+    where.mkdir(parents=True, exist_ok=True)
+    for press, score in zip(presses, scores, strict=True):
+        draw_press(score, press, data, where / f"{Path(score.name).stem}.png")
 
 
 def shading_of(data: PressFolder, circles: list[Circle], *, one_place: bool) -> Shading:

@@ -63,8 +63,11 @@ def calibrate_check(
 
     Each score is good, watch or worn; the exit code is 1 if any is worn.
 
-    Examples: tiptrace calibrate check today.png --gel gel.onnx;
-    tiptrace calibrate check *.png --gel gelsight-mini-virtual --reference reference.png
+    Examples:
+
+      tiptrace calibrate check today.png --gel gel.onnx
+
+      tiptrace calibrate check *.png --gel gelsight-mini-virtual --reference reference.png
     """
     from rich.console import Console
     from rich.table import Table

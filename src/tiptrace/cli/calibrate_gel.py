@@ -27,7 +27,9 @@ def calibrate_gel(
     mm_per_px: Annotated[
         float | None,
         typer.Option(
-            help="Scale of the images; else the rig's, else the csv's column, else 20 mm per width."
+            help="Scale of the images; else the rig's, else the csv's column, else 20 mm per width.",
+            min=1e-4,
+            max=1.0,
         ),
     ] = None,
     rig: Annotated[
@@ -48,8 +50,10 @@ def calibrate_gel(
     Every fifth press is held out and tells how good the network is.
 
     Examples:
-    tiptrace calibrate gel presses/ --out gel.onnx --mm-per-px 0.0625;
-    tiptrace calibrate gel presses/ --out gel_left.onnx --rig rig.yaml --side left
+
+      tiptrace calibrate gel presses/ --out gel.onnx --mm-per-px 0.0625
+
+      tiptrace calibrate gel presses/ --out gel_left.onnx --rig rig.yaml --side left
     """
     from tiptrace.calibration.gel import train_gel
     from tiptrace.cli.files import check_writable

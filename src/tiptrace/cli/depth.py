@@ -33,10 +33,13 @@ def depth(
 ) -> None:
     """Depth of a tactile image against the untouched gel, metric; gels with and without dots.
 
-    Needs a gel model from 'calibrate gel' or 'import-gel'; without one, 'track --patch' shows the contact in the
-    plane.
+    Needs a gel model from 'calibrate gel' or 'import-gel'. Without one, 'track --patch' shows the contact in plane.
 
-    Example: tiptrace depth press.png --reference ref.png --gel gel.onnx --mm-per-px 0.0625 --out depth
+    Examples:
+
+      tiptrace depth press.png --reference ref.png --gel gel.onnx --out depth
+
+      tiptrace depth press.png --reference ref.png --gel vendor.onnx --mm-per-px 0.0625
     """
     import numpy as np
 

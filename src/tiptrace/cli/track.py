@@ -41,8 +41,11 @@ def track(
 
     No gel model is needed. Lost markers keep their number and come back under it.
 
-    Examples: tiptrace track press.avi --out tracks.csv --overlay tracks.mp4;
-    tiptrace track press.avi --patch
+    Examples:
+
+      tiptrace track press.avi --out tracks.csv --overlay tracks.mp4
+
+      tiptrace track press.avi --patch
     """
     from tiptrace.cli.files import check_writable
     from tiptrace.cli.show import progress_bar
