@@ -42,7 +42,7 @@ class Trial:
                 set_off = sample.stamp_ns
         first, last = min(images), max(images)
         latency_s = float(recording.trial.get("truth", {}).get("latency_s", 0.0))
-        return cls(recording, first, (last - first) * 1e-9 + 0.04, (set_off - first) * 1e-9, latency_s)
+        return cls(recording, first, round((last - first) * 25e-9) / 25, (set_off - first) * 1e-9, latency_s)
 
 
 def live_rig(rig: Rig) -> Rig:

@@ -105,7 +105,7 @@ def feed_from(
         },
         pose_s=np.array([(p.stamp_ns - first) * 1e-9 + latency_s for p in poses]),
         T_B_E=np.stack([p.T_B_E for p in poses]),
-        duration_s=(last - first) * 1e-9 + 1.0 / FPS,
+        duration_s=round((last - first) * 1e-9 * FPS) / FPS,
     )
 
 
@@ -220,8 +220,8 @@ class MjpegServer(_Playing):
                 at_s = k * period + lag
             if self.on("drop"):
                 continue
-            place = k % (2 * n)
-            jpeg = jpegs[place if place < n else 2 * n - 1 - place]
+            place = k % (2 * n - 2)  # the turning points are shown once
+            jpeg = jpegs[place if place < n else 2 * n - 2 - place]
             if self.on("freeze"):
                 frozen = frozen or jpeg
                 jpeg = frozen

@@ -7,6 +7,7 @@ import importlib
 import socket
 import struct
 import threading
+import time
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
@@ -22,7 +23,7 @@ from tiptrace.types import OpeningSample, PoseSample
 _PORT = 30004
 _REACH_S = 1.5
 _FIRST_POSE_S = 5.0
-_POLL_S = 0.002
+_POLL_S = 0.0015
 _SILENCE_S = 0.5
 _BACK_OFF_S = (0.1, 1.0)
 _REGISTERS = (*range(12, 20), *range(36, 44))  # that the client can read
@@ -121,7 +122,7 @@ class UrRobot(Closing):
             if stamp_s == last_s:
                 if now_ns - last_ns > _SILENCE_S * NS:
                     return f"silent for {_SILENCE_S:g} s" if receiver.isConnected() else "disconnected"
-                self._stop.wait(_POLL_S)
+                time.sleep(_POLL_S)
                 continue
             pose = receiver.getActualTCPPose()
             if float(receiver.getTimestamp()) == stamp_s and stamp_s > 0.0:  # else they are of two instants
@@ -129,7 +130,7 @@ class UrRobot(Closing):
                     self._queue.meter.fault("clock-jump")
                 self._deliver(self._clock.stamp_ns(round(stamp_s * NS), now_ns), pose, receiver)
                 last_s, last_ns = stamp_s, now_ns
-            self._stop.wait(_POLL_S)
+            time.sleep(_POLL_S)
         return "stopped"
 
     def _deliver(self, stamp_ns: int, pose: list[float], receiver: Any) -> None:
