@@ -20,7 +20,9 @@ from tiptrace.streams.writer import RecordingWriter
 from tiptrace.types import Image, Sample, Side
 
 _SYNC_S = 1.0
-_CHUNK_BYTES = 16 * 1024  # an image or 0.2 s of poses: what of the last second a crash can cost
+_CHUNK_BYTES = (
+    64 * 1024
+)  # 0.07 s of two cameras: what a crash can cost beyond the last sync; each costs 1 kB of index
 _QUEUE_BYTES = 64 * 1024 * 1024  # a minute of a disk that stands still
 _POSE_BYTES = 200
 _MIN_FREE_BYTES = 500 * 1024 * 1024
