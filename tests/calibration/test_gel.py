@@ -1,4 +1,5 @@
 import csv
+import shutil
 
 import cv2
 import numpy as np
@@ -197,6 +198,9 @@ def spoil(name):
         "column": csv_text("image,diameter\n0.png,4\n"),
         "number": csv_text("image,ball_diameter_mm\n0.png,four\n"),
         "ball": csv_text("image,ball_diameter_mm\n0.png,400\n"),
+        "scale": csv_text("image,ball_diameter_mm,mm_per_px\n" + "0.png,4,wide\n" * 6),
+        "two scales": csv_text("image,ball_diameter_mm,mm_per_px\n" + "0.png,4,0.06\n0.png,4,0.03\n" * 3),
+        "no press": lambda folder, _: shutil.copy(folder / "reference.png", folder / "3.png"),
         "half a circle": csv_text("image,ball_diameter_mm,center_u_px\n0.png,4,100\n"),
         "absent image": csv_text("image,ball_diameter_mm\nx.png,4\n"),
         "unreadable": lambda folder, _: (folder / "3.png").write_bytes(b"no image"),
@@ -216,6 +220,9 @@ def spoil(name):
         ("column", "column 'ball_diameter_mm' is missing"),
         ("number", "line 2: could not convert"),
         ("ball", "ball_diameter_mm is 400"),
+        ("scale", "mm_per_px is 'wide'"),
+        ("two scales", "mm_per_px differs between rows"),
+        ("no press", r"3\.png: shows no press; remove it"),
         ("half a circle", "give all of center_u_px, center_v_px, contact_radius_px or none"),
         ("absent image", r"x\.png is missing"),
         ("unreadable", r"3\.png is not a readable image"),

@@ -94,10 +94,7 @@ def read_press_folder(folder: Path, mm_per_px: tuple[float, float] | None = None
         raise CalibrationError(
             f"{folder}: {len(presses)} presses, need at least {MIN_PRESSES} (20 to 40 spread over the gel are good)"
         )
-    scales = {float(row["mm_per_px"]) for row in rows if row.get("mm_per_px")}
-    if len(scales) > 1:
-        raise CalibrationError(f"{folder / 'presses.csv'}: mm_per_px differs between rows; give one scale")
-    given = mm_per_px or ((scale := scales.pop(), scale) if scales else None)
+    given = mm_per_px or _given_scale(rows, folder / "presses.csv")
     scale = GELSIGHT_MINI_WIDTH_MM / reference.shape[1]
     try:
         check_untouched(reference)
@@ -161,6 +158,23 @@ def _read_rows(path: Path) -> list[dict[str, str]]:
         if rows and column not in rows[0]:
             raise CalibrationError(f"{path}: column '{column}' is missing; it has {', '.join(rows[0])}")
     return rows
+
+
+def _given_scale(rows: list[dict[str, str]], path: Path) -> tuple[float, float] | None:
+    """Scale (x, y) of the csv's optional column."""
+    texts = {row["mm_per_px"] for row in rows if row.get("mm_per_px")}
+    if not texts:
+        return None
+    if len(texts) > 1:
+        raise CalibrationError(f"{path}: mm_per_px differs between rows; give one scale")
+    text = texts.pop()
+    try:
+        scale = float(text)
+    except ValueError:
+        scale = 0.0
+    if not 1e-4 <= scale <= 1.0:
+        raise CalibrationError(f"{path}: mm_per_px is '{text}'; a GelSight Mini has 0.06 at 320 px width")
+    return scale, scale
 
 
 def _press(folder: Path, row: dict[str, str], line: int, reference: Image, dotted: bool) -> Press:
