@@ -1,22 +1,26 @@
 """How long the sensing chain takes, step by step and as a stereo loop, beside the reference SDK's way of doing it.
 
-    OMP_NUM_THREADS=1 python benchmarks/sensing_speed.py trial.mcap [--pairs 300] [--endless 20000]
+    OMP_NUM_THREADS=1 python benchmarks/sensing_speed.py trial.mcap [--part loop] [--depth none] [--pairs 300]
 
+Parts: ``steps``, ``loop``, ``resolution``, ``growth`` and, only when asked for, ``endless`` (memory over 20 000 pairs).
 The recording comes from ``tiptrace simulate --out trial.mcap``. Loop and reference path take turns within the run, so
-that a busy machine slows both. The reference path is a plain reimplementation of that SDK's steps: a dense
-5-64-64-64-2 network in double precision, ``scipy.griddata`` under the dots, a double-precision cosine transform,
-Lucas–Kanade. One thread per finger.
+that a busy machine slows both; the reference path has a process of its own, so that its memory is not counted. It is
+a plain reimplementation of that SDK's steps: a dense 5-64-64-64-2 network in double precision, ``scipy.griddata``
+under the dots, a double-precision cosine transform, Lucas–Kanade. One thread per finger, in both.
 """
 
 from __future__ import annotations
 
 import argparse
+import multiprocessing
 import os
 import resource
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from itertools import pairwise
+from dataclasses import replace
+from itertools import islice, pairwise
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 import cv2
@@ -34,10 +38,11 @@ from tiptrace.perception.markers import detect_markers
 from tiptrace.perception.poisson import PoissonSolver
 from tiptrace.perception.registration import RegisteredTracker
 from tiptrace.perception.seeding import seed
+from tiptrace.perception.settings import SensingConfig
 from tiptrace.perception.tracking import LucasKanadeTracker
 from tiptrace.streams.recording import Recording
 from tiptrace.streams.synchronise import synchronise
-from tiptrace.tracer import make_tracer
+from tiptrace.tracer import Map, Sensing, TipTracer, make_estimator, sensing_of
 from tiptrace.types import SIDES, ImageSample, Observation
 
 S = 62.5e-6
@@ -99,12 +104,22 @@ class ReferencePath:
         return sample_map(depth.astype(np.float32), uv)
 
 
-def images(observations: list[Observation]) -> list[dict[str, np.ndarray]]:
-    out = []
-    for o in observations:
-        samples = {side: o.finger(side).sample for side in SIDES}
-        out.append({side: s.image for side, s in samples.items() if isinstance(s, ImageSample)})
-    return out
+def images(observation: Observation) -> dict[str, np.ndarray]:
+    samples = {side: observation.finger(side).sample for side in SIDES}
+    return {side: s.image for side, s in samples.items() if isinstance(s, ImageSample)}
+
+
+def with_images(observation: Observation, pictures: list[np.ndarray]) -> Observation:
+    left, right = (
+        replace(f, sample=replace(f.sample, image=im))
+        for f, im in zip((observation.left, observation.right), pictures, strict=True)
+    )
+    return replace(observation, left=left, right=right)
+
+
+def tracer_of(recording: Recording, method: str, depth: str, both: Map = map) -> TipTracer:
+    config = SensingConfig(method=sensing_of(method), depth=depth)
+    return TipTracer(Sensing(recording, config, both), make_estimator(method, recording))
 
 
 def steps(frames: list[np.ndarray], reference: np.ndarray) -> None:
@@ -130,7 +145,8 @@ def steps(frames: list[np.ndarray], reference: np.ndarray) -> None:
     colours = rng.normal(0, 0.1, (H * W, 3)).astype(np.float32)
     place = rng.uniform(0, 1, (H * W, 2)).astype(np.float32)
     solvers = {s: PoissonSolver((H // s, W // s), (S * s, S * s)) for s in (1, 2)}
-    fill = DotFill(chain.shape, (tracker.mask_radius_px + 1.5) / 2)
+    fill = DotFill((tracker.mask_radius_px + 1.5) / 2)
+    planes = np.ascontiguousarray(np.moveaxis(maps[2], -1, 0))
     rows: list[tuple[str, Callable[[], object]]] = [
         ("jpeg decode", lambda: cv2.imdecode(jpeg, cv2.IMREAD_COLOR)),
         ("detection (first image only)", lambda: detect_markers(frames[0])),
@@ -140,7 +156,7 @@ def steps(frames: list[np.ndarray], reference: np.ndarray) -> None:
         ("network, half resolution", lambda: gel.slopes(colours[: H * W // 4], place[: H * W // 4])),
         ("fill: nearest, full resolution", lambda: nearest_fill(maps[1], full_mask)),
         ("fill: smooth, half resolution", lambda: smooth_fill(maps[2], mask)),
-        ("fill: along edges, half resolution", lambda: fill.apply(maps[2].copy(), uv / 2)),
+        ("fill: along edges, half resolution", lambda: fill.apply(planes.copy(), uv / 2)),
         ("Poisson, full resolution", lambda: solvers[1].integrate(maps[1][..., 0], maps[1][..., 1])),
         ("Poisson, half resolution", lambda: solvers[2].integrate(maps[2][..., 0], maps[2][..., 1])),
         ("untouched gel, half resolution", lambda: untouched_gel(maps[2][..., 0] * 1e-3, maps[2])),
@@ -153,38 +169,55 @@ def steps(frames: list[np.ndarray], reference: np.ndarray) -> None:
         print(f"{name:<44} {p50:>8.2f} {p99:>8.2f}")
 
 
-def loop(recording: Recording, observations: list[Observation], method: str, every_reference: int) -> None:
-    """The stereo loop, with the reference path in between."""
-    pictures = images(observations)
-    jpegs = [
-        {s: cv2.imencode(".jpg", im[s], [cv2.IMWRITE_JPEG_QUALITY, 95])[1] for s in SIDES}
-        for im in pictures[:20]
-    ]
-    theirs = {side: ReferencePath(pictures[0][side]) for side in SIDES}
-    ours, decode, reference = [], [], []
+def serve_reference(first: dict[str, np.ndarray], line: Connection) -> None:
+    """Child process: the reference path on pairs sent, answered with its time in ms."""
+    cv2.setNumThreads(1)
+    theirs = {side: ReferencePath(first[side]) for side in SIDES}
     with ThreadPoolExecutor(2) as pool:
-        tracer = make_tracer(recording, method, pool.map)
-        for k, o in enumerate(observations):
+        while (pair := line.recv()) is not None:
             start = time.perf_counter()
-            tracer.update(o)
-            ours.append(1e3 * (time.perf_counter() - start))
-            start = time.perf_counter()
-            list(pool.map(lambda s, k=k: cv2.imdecode(jpegs[k % len(jpegs)][s], cv2.IMREAD_COLOR), SIDES))
-            decode.append(1e3 * (time.perf_counter() - start))
+            list(pool.map(lambda s, pair=pair: theirs[s](pair[s]), SIDES))
+            line.send(1e3 * (time.perf_counter() - start))
+
+
+def loop(recording: Recording, pairs: int, method: str, depth: str, every_reference: int) -> None:
+    """The stereo loop, with the reference path in between."""
+    stream = islice(synchronise(recording), pairs)
+    ours, decoded, reference = [], [], []
+    line, theirs = multiprocessing.Pipe()
+    with ThreadPoolExecutor(2) as pool:
+        tracer = tracer_of(recording, method, depth, pool.map)
+        cpu = 0.0
+        for k, o in enumerate(stream):
+            pictures = images(o)
+            if k == 0:
+                context = multiprocessing.get_context("spawn")
+                child = context.Process(target=serve_reference, args=(pictures, theirs), daemon=True)
+                child.start()
+            jpegs = [cv2.imencode(".jpg", pictures[s], [cv2.IMWRITE_JPEG_QUALITY, 95])[1] for s in SIDES]
+            start, cpu_start = time.perf_counter(), time.process_time()
+            again = list(pool.map(lambda jpeg: cv2.imdecode(jpeg, cv2.IMREAD_COLOR), jpegs))
+            middle = time.perf_counter()
+            tracer.update(with_images(o, again))
+            end = time.perf_counter()
+            if k >= 5:
+                ours.append(1e3 * (end - middle))
+                decoded.append(1e3 * (end - start))
+                cpu += time.process_time() - cpu_start
             if k % every_reference == every_reference - 1:
-                start = time.perf_counter()
-                list(pool.map(lambda s, k=k: theirs[s](pictures[k][s]), SIDES))
-                reference.append(1e3 * (time.perf_counter() - start))
-    ours, decode = np.array(ours[5:]), np.array(decode[5:])
-    print(f"\nstereo loop, method {method}, {len(ours)} pairs: images in, tip estimate out")
+                line.send(pictures)
+                reference.append(line.recv())
+    line.send(None)
+    print(f"\nstereo loop, method {method}, depth {depth}, {len(ours)} pairs: images in, tip estimate out")
     for name, ms in (
         ("decoded images", ours),
-        ("with jpeg decoding", ours + decode),
-        ("reference path", np.array(reference)),
+        ("with jpeg decoding", decoded),
+        ("reference path", reference[1:]),
     ):
         p50, p99 = np.percentile(ms, (50, 99))
         print(f"  {name:<22} p50 {p50:7.2f} ms = {1e3 / p50:6.1f} pairs/s   p99 {p99:7.2f} ms")
-    print(f"  reference path / loop: {np.median(reference) / np.median(ours):.1f} ×")
+    print(f"  reference path / loop: {np.median(reference[1:]) / np.median(ours):.1f} ×")
+    print(f"  processor time with decoding {1e3 * cpu / len(ours):.1f} ms per pair")
     print(f"  peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB")
 
 
@@ -257,17 +290,29 @@ def growth(reference: np.ndarray, frame: np.ndarray) -> None:
         print(f"{'tracking, ' + f'{len(some)} markers':<44} {p50:>8.2f} {p99:>8.2f}")
 
 
-def endless(recording: Recording, observations: list[Observation], method: str, count: int) -> None:
-    """Memory over many frames."""
-    tracer = make_tracer(recording, method)
-    marks = {count // 20: 0.0, count - 1: 0.0}
-    there_and_back = [*range(len(observations)), *range(len(observations) - 2, 0, -1)]
-    for k in range(count):
-        tracer.sensing(observations[there_and_back[k % len(there_and_back)]])
-        if k in marks:
-            marks[k] = rss_mb()
-    first, last = marks.values()
-    print(f"\nmemory over {count} pairs: {first:.0f} MB after {count // 20}, {last:.0f} MB at the end")
+def there_and_back(recording: Recording, length: int) -> Iterator[Observation]:
+    """Pairs forwards and backwards for ever, as jpeg in memory."""
+    kept = []
+    for o in islice(synchronise(recording), length):
+        pictures = images(o)
+        jpegs = [cv2.imencode(".jpg", pictures[s], [cv2.IMWRITE_JPEG_QUALITY, 95])[1] for s in SIDES]
+        kept.append((with_images(o, [np.zeros((1, 1, 3), np.uint8)] * 2), jpegs))
+    while True:
+        for o, jpegs in [*kept, *kept[-2:0:-1]]:
+            yield with_images(o, [cv2.imdecode(jpeg, cv2.IMREAD_COLOR) for jpeg in jpegs])
+
+
+def endless(recording: Recording, pairs: int, method: str, depth: str, count: int) -> None:
+    """Memory of the sensing over many pairs, one thread per finger."""
+    marks = {count // 20: 0.0, count // 2: 0.0, count - 1: 0.0}
+    with ThreadPoolExecutor(2) as pool:
+        tracer = tracer_of(recording, method, depth, pool.map)
+        for k, o in enumerate(islice(there_and_back(recording, pairs), count)):
+            tracer.sensing(o)
+            if k in marks:
+                marks[k] = rss_mb()
+    told = ", ".join(f"{mb:.1f} MB after {k + 1}" for k, mb in marks.items())
+    print(f"\nmemory over {count} pairs (the benchmark keeps {pairs} as jpeg): {told}")
 
 
 def main() -> None:
@@ -276,28 +321,31 @@ def main() -> None:
     )
     parser.add_argument("recording", type=Path)
     parser.add_argument("--method", default="full")
+    parser.add_argument("--depth", default="network", choices=("network", "none"))
+    parser.add_argument(
+        "--part", action="append", choices=("steps", "loop", "resolution", "growth", "endless")
+    )
     parser.add_argument("--pairs", type=int, default=200)
     parser.add_argument("--reference-every", type=int, default=20)
-    parser.add_argument(
-        "--endless", type=int, default=0, help="pairs to run for memory growth; 20000 takes minutes"
-    )
+    parser.add_argument("--count", type=int, default=20000, help="pairs of the endless part")
     args = parser.parse_args()
     cv2.setNumThreads(1)
+    parts = args.part or ["loop", "steps", "resolution", "growth"]
     recording = Recording(args.recording)
-    observations = []
-    for o in synchronise(recording):
-        observations.append(o)
-        if len(observations) == args.pairs:
-            break
-    left, reference = [im["left"] for im in images(observations)], recording.references["left"]
     load = f"load average {os.getloadavg()[0]:.1f} on {os.cpu_count()} CPUs"
-    print(f"{args.recording.name}: {len(observations)} pairs; {load}")
-    steps(left, reference)
-    loop(recording, observations, args.method, args.reference_every)
-    resolution(left, reference)
-    growth(reference, left[0])
-    if args.endless:
-        endless(recording, observations, args.method, args.endless)
+    print(f"{args.recording.name}: {args.pairs} pairs; {load}")
+    if "loop" in parts:
+        loop(recording, args.pairs, args.method, args.depth, args.reference_every)
+    left = [images(o)["left"] for o in islice(synchronise(recording), 40)]
+    reference = recording.references["left"]
+    if "steps" in parts:
+        steps(left, reference)
+    if "resolution" in parts:
+        resolution(left, reference)
+    if "growth" in parts:
+        growth(reference, left[0])
+    if "endless" in parts:
+        endless(recording, args.pairs, args.method, args.depth, args.count)
 
 
 if __name__ == "__main__":

@@ -57,10 +57,12 @@ class DotMeter:
         _measure_dots(grey, mask, gel[0], uv, ink, area, self._radius, self._core)
         return DotMeasurement(uv_px=uv, ink=ink, area_px=area)
 
-    def mask(self, uv_px: FloatArray, shape: tuple[int, int], step: int = 1) -> BoolArray:
+    def mask(
+        self, uv_px: FloatArray, shape: tuple[int, int], step: int = 1, margin_px: float = 0.5
+    ) -> BoolArray:
         """Pixels of the dots at places (n, 2), with a margin, in a map (H, W) that has every ``step``-th pixel."""
         mask = np.zeros(shape, dtype=np.bool_)
-        _stamp_discs(mask, np.ascontiguousarray(uv_px), self.mask_radius_px / step + 0.5, step)
+        _stamp_discs(mask, np.ascontiguousarray(uv_px), (self.mask_radius_px + margin_px) / step, step)
         return mask
 
 

@@ -18,24 +18,23 @@ Float32Map = NDArray[np.float32]
 _RING_POINTS = 48
 _LEAST_ENDS = 11  # points that must be seen for a direction to be judged
 _VARIED = 0.04  # standard deviation of the slope around a dot below which the smooth fill is left as it is
-_OUTSIDE_PX = 1.0  # map pixels beyond the dot where values are taken
 
 
 class DotFill:
     """Fills discs of one radius in maps."""
 
-    def __init__(self, radius_px: float) -> None:
-        """For discs of a radius in map pixels."""
-        self._radius = radius_px
+    def __init__(self, radius_px: float, outside_px: float = 1.0) -> None:
+        """For discs of a radius; values are taken so much outside them. Map pixels."""
+        self._radius, self._outside = radius_px, outside_px
         angle = 2.0 * np.pi * np.arange(_RING_POINTS) / _RING_POINTS
         self._double = np.stack([np.cos(angle), np.sin(angle)], axis=1)  # (m, 2)
-        self._ring = (radius_px + _OUTSIDE_PX) * self._double  # (m, 2)
+        self._ring = (radius_px + outside_px) * self._double  # (m, 2)
 
     def apply(self, planes: Float32Map, uv: FloatArray) -> None:
         """Overwrite discs at places (n, 2), map px, in smoothly filled maps (c, H, W)."""
         directions, sure = _directions(planes, uv, self._ring, self._double)
         _borrow_from_nearest(directions, sure, uv)
-        _fill_discs(planes, uv, directions, self._radius)
+        _fill_discs(planes, uv, directions, self._radius, self._outside)
 
 
 @compiled
@@ -152,7 +151,9 @@ def _borrow_from_nearest(directions: FloatArray, sure: BoolArray, uv: FloatArray
 
 
 @compiled
-def _fill_discs(planes: Float32Map, uv: FloatArray, directions: FloatArray, radius: float) -> None:
+def _fill_discs(
+    planes: Float32Map, uv: FloatArray, directions: FloatArray, radius: float, outside: float
+) -> None:
     """Between the two ends of the chord along a dot's direction, each pixel takes their mean by nearness."""
     C, H, W = planes.shape
     half = int(np.ceil(radius)) + 1
@@ -168,7 +169,7 @@ def _fill_discs(planes: Float32Map, uv: FloatArray, directions: FloatArray, radi
                 if inside <= 0.0:
                     continue
                 along = du * a + dv * b
-                reach = np.sqrt(inside + along * along) + _OUTSIDE_PX
+                reach = np.sqrt(inside + along * along) + outside
                 ahead, behind = reach - along, reach + along
                 front_seen = _inside(planes, u + ahead * a, v + ahead * b)
                 back_seen = _inside(planes, u - behind * a, v - behind * b)

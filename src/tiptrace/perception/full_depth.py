@@ -25,6 +25,8 @@ from tiptrace.types import BoolArray, FloatArray, Image, IntArray
 Float32Map = NDArray[np.float32]
 
 _RING_POINTS = 8
+_FILL_MARGIN_PX = 1.5  # around a dot's radius, that is filled along edges
+_FILL_OUTSIDE_PX = 2.0  # beyond that, where values are taken
 _VISIBLE = 0.1  # of the image that must be untouched to level a map by it
 _CALM = 0.02  # slope below which gel may tell about the lamps
 _CALM_AROUND_PX = 8.0  # on the mean over so many pixels each way
@@ -112,7 +114,7 @@ class FullDepth:
 
     def expect_dots(self, radius_px: float) -> None:
         """Say how large the masked discs of dots are."""
-        self._dot_fill = DotFill((radius_px + 0.75 * self.step) / self.step)
+        self._dot_fill = DotFill((radius_px + _FILL_MARGIN_PX) / self.step, _FILL_OUTSIDE_PX / self.step)
 
     def at(self, depth: DepthMap, uv_px: FloatArray) -> FloatArray:
         """Depth (n,) m at image positions (n, 2)."""

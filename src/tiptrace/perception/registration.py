@@ -27,6 +27,7 @@ _INK = 0.45  # of the first frame's contrast
 _OFF_GRID = 0.38  # of the pitch: distance from where the neighbours say
 _SEARCH = 0.45  # of the pitch: how far from its predicted place a lost dot is looked for …
 _FOUND = 0.6  # … and may be found
+_MARGIN_PX = 1.0  # around a dot, where the network must not look either
 _EVERY = slice(None)
 _SEARCH_FRAMES = (
     5  # a dot is looked for in each of the first frames that it is missing from, then in every fifth
@@ -63,7 +64,7 @@ class RegisteredTracker:
 
     def mask(self, uv_px: FloatArray, shape: tuple[int, int], step: int = 1) -> BoolArray:
         """Pixels of dots at places (n, 2), with a margin, in a map (H, W) that has every ``step``-th pixel."""
-        return self._meter.mask(uv_px, shape, step)
+        return self._meter.mask(uv_px, shape, step, _MARGIN_PX)
 
     def update(self, image: Image) -> tuple[FloatArray, BoolArray]:
         """Track into the next image: uv_px (n, 2), NaN where lost, and tracked (n,)."""
