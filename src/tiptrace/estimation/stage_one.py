@@ -15,7 +15,7 @@ from tiptrace.estimation.motion import MotionConfig, Motions, TemplateFit
 from tiptrace.estimation.pads import PadMarkers
 from tiptrace.estimation.patch import PatchConfig, trust
 from tiptrace.estimation.pose_track import HandStates, smooth_at
-from tiptrace.estimation.tip_map import DRIFT, TAU, C, P, TipMap, TipMapConfig, assumed_tip_map, solve_tip_map
+from tiptrace.estimation.tip_map import DRIFT, TAU, C, TipMap, TipMapConfig, assumed_tip_map, solve_tip_map
 from tiptrace.geometry.transforms import skew
 from tiptrace.types import BoolArray, FloatArray, PoseSample
 
@@ -28,14 +28,7 @@ class StageOneConfig(BaseModel):
     memory_frames: int = Field(default=1500, ge=10)
     memory_poses: int = Field(default=30000, ge=100)
     solve_frames: int = Field(default=250, ge=10)  # more are thinned out evenly
-    slipped_correlation: float = Field(default=8.0, gt=1)  # residuals so correlated mean a slip in Stage I
-    rescue_sigma_m: float = Field(
-        default=2e-3, gt=0
-    )  # an anchor no better than this is sought in parts of Stage I
     template_rounds: int = Field(default=3, ge=1)
-
-
-_LATER = (0.25, 0.4, 0.55)  # parts of Stage I left out at its start
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,30 +137,10 @@ class StageOne:
     ) -> Anchoring:
         """Template, motions and tip map of the segment; ``known`` is an earlier map of the same gels.
 
-        Where the whole leaves the tip undetermined because the tool slipped in the grasp on the way, which shows in
-        its residuals, later parts alone are tried as well, and the one that says most about the tip is taken.
-
         Raises:
             GeometryError: too few frames, markers or poses.
         """
-        best = self._solve_from(0, latency, prior, known)
-        slipped = best.tip_map.correlation > self._config.slipped_correlation
-        if not slipped or _sigma_m(best) < self._config.rescue_sigma_m:
-            return best
-        for share in _LATER:
-            try:
-                part = self._solve_from(int(share * len(self._frames)), latency, prior, known)
-            except (GeometryError, np.linalg.LinAlgError):
-                continue
-            if _sigma_m(part) < _sigma_m(best):
-                best = part
-        return best
-
-    def _solve_from(
-        self, first: int, latency: tuple[float, float] | None, prior: TipPrior | None, known: TipMap | None
-    ) -> Anchoring:
-        """From the frames after the first ones."""
-        stamps, X, fit, weights, motions = self._fit_template(first)
+        stamps, X, fit, weights, motions = self._fit_template()
         duration = max((stamps[-1] - stamps[0]) * 1e-9, 1e-3)
         good: BoolArray = motions.sides[:, 0] * motions.sides[:, 1] > 0
         if good.sum() < 3:
@@ -224,15 +197,12 @@ class StageOne:
         while len(self._frames) > 3 and self._frames[-1][0] > stamp_ns:
             self._frames.pop()
 
-    def _fit_template(
-        self, start_at: int = 0
-    ) -> tuple[FloatArray, FloatArray, TemplateFit, FloatArray, Motions]:
+    def _fit_template(self) -> tuple[FloatArray, FloatArray, TemplateFit, FloatArray, Motions]:
         """Template from all frames, alternating with the motions."""
-        frames = list(self._frames)[start_at:]
-        if len(frames) < 3:
-            raise GeometryError(f"Stage I has {len(frames)} frames, at least 3 are needed")
-        step = -(-len(frames) // self._config.solve_frames)
-        frames = frames[::step]
+        if len(self._frames) < 3:
+            raise GeometryError(f"Stage I has {len(self._frames)} frames, at least 3 are needed")
+        step = -(-len(self._frames) // self._config.solve_frames)
+        frames = list(self._frames)[::step]
         stamps = np.array([s for s, _ in frames], dtype=np.float64)
         X = np.stack([m.X for _, m in frames])  # (T, N, 3)
         first, weights = frames[0][1], self.trust()
@@ -252,11 +222,6 @@ def _first_seen(X: FloatArray) -> FloatArray:
     total = np.maximum(seen.sum(axis=0), 1)[:, None]
     M = np.where(seen[..., None], head, 0.0).sum(axis=0) / total
     return np.asarray(np.where(np.any(seen, axis=0).reshape(-1, 1), M, np.nan))
-
-
-def _sigma_m(anchoring: Anchoring) -> float:
-    """Standard deviation of the anchor along its weakest axis."""
-    return float(np.sqrt(np.linalg.eigvalsh(anchoring.tip_map.covariance[P, P])[-1]))
 
 
 def _select(m: Motions, good: BoolArray) -> Motions:
