@@ -40,8 +40,7 @@ def calibrate_rig(
     """Solve where both sensors sit, their scale, what their gels show, and the cameras' latency.
 
     Grip a rod that is clamped to the table and move the hand by about 0.5 mm and 2° in all six axes about the pads, for
-    half a minute (`tiptrace plan-anchor --motion wiggle` exports such a motion). Swapped, mirrored and inverted sensors
-    are told; what the wiggle leaves open is said in words.
+    half a minute. Swapped, mirrored and inverted sensors are told; what the wiggle leaves open is said in words.
 
     Examples:
 

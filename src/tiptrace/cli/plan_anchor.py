@@ -74,7 +74,9 @@ def _table(predictions: list[Prediction], motion: str) -> object:
 
     table = Table(title="Anchoring motions: standard deviation of the tip along the hand's start axes")
     for column in ("motion", "σx mm", "σy mm", "σz mm", "force N", "gel shear mm", "speed mm/s", "remark"):
-        table.add_column(column, justify="left" if column in ("motion", "remark") else "right")
+        table.add_column(
+            column, justify="left" if column in ("motion", "remark") else "right", no_wrap=column == "motion"
+        )
     for p in predictions:
         sigma = [f"{v * 1e3:.2f}" if v < 0.05 else "open" for v in p.sigma_m]
         remark = (
@@ -104,6 +106,8 @@ def _urscript(p: Prediction, task: Task, T: FloatArray) -> str:
 
     from tiptrace.geometry.transforms import rotation_log
 
+    along = task.tip_E - task.pads_E
+    x, y, z = _APPROACH_MPS * along / np.linalg.norm(along)  # along the tool, as it is held
     lines = [
         "def tiptrace_anchor():",
         f"  local limit = {1.5 * p.force_n:.2f}",
@@ -119,7 +123,7 @@ def _urscript(p: Prediction, task: Task, T: FloatArray) -> str:
         "  run guard()",
         "  zero_ftsensor()",
         "  local here = get_actual_tcp_pose()",
-        f"  local ahead = pose_trans(here, p[0, 0, {_APPROACH_MPS}, 0, 0, 0])",
+        f"  local ahead = pose_trans(here, p[{x:.6f}, {y:.6f}, {z:.6f}, 0, 0, 0])",
         f"  while norm(get_tcp_force()) < {task.preload_n:.2f}:",
         "    speedl([ahead[0] - here[0], ahead[1] - here[1], ahead[2] - here[2], 0, 0, 0], 0.05, 0.008)",
         "  end",

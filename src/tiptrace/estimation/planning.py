@@ -18,6 +18,7 @@ from tiptrace.geometry.transforms import invert, rotation_exp, transform
 from tiptrace.types import SIDES, FloatArray
 
 _FPS, _POSE_HZ, _LEAD_S = 25.0, 125.0, 0.3
+_RAMP_S = 0.3  # of a motion's start and end
 _DEFAULT_STRAIN_M = 2.5e-3
 _SHIFT_SHARE = 0.3  # of a tip displacement that the tool makes by shifting in the pads; the rest it turns
 _PATCH_HALF_M = 7e-3
@@ -46,7 +47,9 @@ class Wiggle:
     def poses(self, s: FloatArray, tip_E: FloatArray, pads_E: FloatArray) -> FloatArray:
         """Hand relative to its start, T_E0_E (T, 4, 4), at times (T,) s."""
         a = 2 * np.pi * np.clip(s / self.duration_s, 0.0, 1.0)[:, None] * np.array(self.cycles)
-        wave = np.sin(a)
+        since, until = s / _RAMP_S, (self.duration_s - s) / _RAMP_S
+        swell = np.clip(np.minimum(since, until), 0.0, 1.0)[:, None]  # a robot cannot start at full speed
+        wave = swell * swell * (3.0 - 2.0 * swell) * np.sin(a)
         w = np.radians(self.rotation_deg) * wave[:, :2]
         R = rotation_exp(np.concatenate([w, np.zeros((len(s), 1))], axis=1))
         pivot = tip_E if self.about_tip else pads_E
