@@ -29,7 +29,7 @@ TYPES = {
     "std_msgs/msg/Float64": Float64,
 }
 NS = 1_000_000_000
-SPEED = 0.5
+SPEED = 0.7
 
 
 def stamp(message) -> int:
@@ -83,7 +83,7 @@ def main(recording: Path, out: Path) -> None:
             time.sleep(0.5)
             begun += 1.0
     quiet, count = time.monotonic(), -1
-    while time.monotonic() - quiet < 4.0:
+    while time.monotonic() - quiet < 12.0:  # the node may be slower than the recording
         if len(found["tip"]) != count:
             quiet, count = time.monotonic(), len(found["tip"])
         time.sleep(0.2)
