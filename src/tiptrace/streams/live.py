@@ -206,7 +206,10 @@ class LiveStream:
         return [*marks, *(sample for _, sample in sorted(found, key=itemgetter(0)))]
 
     def _counts(self, sample: Sample) -> bool:
-        return not self.standby and self._begin_ns is not None and sample.stamp_ns >= self._begin_ns
+        if self.standby:
+            return False
+        early = self._begin_ns is None or sample.stamp_ns < self._begin_ns
+        return isinstance(sample, PhaseSample) or not early  # a mark holds from before the first image
 
     def _tap(self, sample: Sample, log_time_ns: int, jpeg: bytes | None) -> None:
         if self.tap is not None and self._counts(sample):
