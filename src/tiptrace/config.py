@@ -25,6 +25,12 @@ def _in_metres(v: Vector3) -> Vector3:
     return v
 
 
+def _spread(v: Vector3) -> Vector3:
+    if min(v) < 1e-6:
+        raise ValueError(f"{v}: a standard deviation is at least 1e-6 m")
+    return v
+
+
 Metres3 = Annotated[Vector3, AfterValidator(_in_metres)]
 
 
@@ -193,7 +199,7 @@ class Tool(_Model):
     format: Literal["tiptrace-tool/1"] = "tiptrace-tool/1"
     thickness_m: float | None = Field(default=None, gt=0, lt=0.2)
     tip_E_m: Metres3 | None = None
-    tip_sigma_m: Annotated[Vector3, AfterValidator(_in_metres)] | None = None
+    tip_sigma_m: Annotated[Vector3, AfterValidator(_in_metres), AfterValidator(_spread)] | None = None
     tip_radius_m: float | None = Field(default=None, ge=0, lt=0.05)
 
 
