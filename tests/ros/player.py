@@ -67,7 +67,8 @@ def main(recording: Path, out: Path) -> None:
     )
     executor = SingleThreadedExecutor()
     executor.add_node(node)
-    threading.Thread(target=executor.spin, daemon=True).start()
+    spinning = threading.Thread(target=executor.spin, daemon=True)
+    spinning.start()
     deadline = time.monotonic() + 90
     while any(p.get_subscription_count() == 0 for p in publishers.values()) and time.monotonic() < deadline:
         time.sleep(0.1)
@@ -88,7 +89,8 @@ def main(recording: Path, out: Path) -> None:
             quiet, count = time.monotonic(), len(found["tip"])
         time.sleep(0.2)
     out.write_text(json.dumps(found))
-    executor.shutdown(timeout_sec=1.0)
+    executor.shutdown(timeout_sec=5.0)
+    spinning.join(timeout=5.0)
     node.destroy_node()
     rclpy.shutdown()
 
