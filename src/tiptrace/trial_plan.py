@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
+import os
+from collections import Counter
 from pathlib import Path
 from typing import Any, cast
 
@@ -124,7 +127,29 @@ def _expand(paths: list[Path]) -> tuple[list[Path], list[str]]:
             if recording.resolve() in found:
                 notes.append(f"{recording}: given more than once, evaluated once")
             found.setdefault(recording.resolve(), recording)
-    return list(found.values()), notes
+    return _without_copies(list(found.values()), notes), notes
+
+
+def _without_copies(recordings: list[Path], notes: list[str]) -> list[Path]:
+    """Files of different content; of those with the same one the first. Only files of equal size are read."""
+    sizes = Counter(_size(path) for path in recordings)
+    first: dict[str, Path] = {}
+    kept = []
+    for path in recordings:
+        size = _size(path)
+        if size > 0 and sizes[size] > 1:
+            with path.open("rb") as file:
+                other = first.setdefault(hashlib.file_digest(file, "sha256").hexdigest(), path)
+            if other != path:
+                notes.append(f"{path}: the same content as {other}, evaluated once")
+                continue
+        kept.append(path)
+    return kept
+
+
+def _size(path: Path) -> int:
+    """Bytes; 0 for what is no readable file, which will say so itself."""
+    return path.stat().st_size if path.is_file() and os.access(path, os.R_OK) else 0
 
 
 def _truth_of(recording: Path, truth: Path | None) -> Path | None:

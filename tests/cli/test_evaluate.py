@@ -41,10 +41,14 @@ def rows(out: Path, table: str) -> list[dict[str, object]]:
 def test_an_unreadable_file_is_reported_and_the_rest_goes_on(recording: Path, tmp_path: Path):
     bad = tmp_path / "bad.mcap"
     bad.write_text("nope")
+    copy = tmp_path / "copy.mcap"
+    copy.write_bytes(recording.read_bytes())
     out = tmp_path / "out"
-    result = run(recording, recording, bad, "--analytic", "auto", "--out", out, "--workers", 1)
+    result = run(recording, recording, copy, bad, "--analytic", "auto", "--out", out, "--workers", 1)
     assert result.exit_code == 1
     assert "given more than once" in " ".join(result.output.split())
+    assert "the same content as" in " ".join(result.output.split())
+    assert result.output.count("failed:") == 1  # all methods alike
     assert {r["trial"] for r in rows(out, "failures")} == {str(bad)}
     *ours, published = rows(out, "overall")
     assert [r["method"] for r in ours] == list(METHODS)

@@ -107,6 +107,12 @@ def test_statistics_leave_unknown_rows_out_and_add_up():
     assert np.isfinite(nothing["mean"]).all()
 
 
+def test_lerobot_never_divides_by_the_count_of_a_column_without_values(tmp_path: Path):
+    write_lerobot(tmp_path, [made_up(5)], "v2.1")  # no covariance anywhere
+    (line,) = (tmp_path / "meta/episodes_stats.jsonl").read_text().splitlines()
+    assert all(s["count"][0] > 0 for s in json.loads(line)["stats"].values())
+
+
 def test_an_episode_unlike_the_first_is_refused():
     check = LikeTheFirst()
     check(made_up(5))

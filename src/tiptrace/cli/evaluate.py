@@ -80,6 +80,7 @@ def evaluate(
 
     from tiptrace.errors import ConfigError
     from tiptrace.evaluation.suite_store import SuiteStore
+    from tiptrace.evaluation.suite_tables import without_truth
     from tiptrace.evaluation.versions import library_versions
     from tiptrace.trial_plan import recording_tasks, suite_tasks
 
@@ -105,7 +106,7 @@ def evaluate(
     records = _report_outliers(tasks, names, store, records)
     found = _run_budget(level, seed, budget, names, store, workers, scheduler)
     _show(console, records, _report(store, records, found, settings, suite))
-    if any(r.failure for r in records):
+    if any(r.failure for r in records) or without_truth(records):
         raise typer.Exit(1)
 
 
@@ -213,6 +214,7 @@ def _report(
     suite: str | None,
 ) -> Path:
     from tiptrace.evaluation.suite_report import SuiteData, write_suite_report
+    from tiptrace.evaluation.suite_tables import without_truth
     from tiptrace.evaluation.versions import library_versions
 
     store.finish(records)
@@ -224,6 +226,7 @@ def _report(
         budget=budget,
         settings={k: v for k, v in settings.items() if v},
         versions=library_versions(),
+        notes=tuple(f"{trial}: no ground truth, in no error below" for trial in without_truth(records)),
         command=shlex.join(["tiptrace", *sys.argv[1:]]),
     )
     return write_suite_report(store.folder, data)
@@ -235,7 +238,7 @@ def _show(console: Any, records: list[TrialRecord], page: Path) -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    from tiptrace.evaluation.suite_tables import failures_table
+    from tiptrace.evaluation.suite_tables import failures_table, without_truth
     from tiptrace.evaluation.terminal_table import terminal_table
 
     errors = terminal_table(records)
@@ -249,4 +252,6 @@ def _show(console: Any, records: list[TrialRecord], page: Path) -> None:
         console.print(errors.note, markup=False, highlight=False)
     for trial, method, reason in failures_table(records).text_rows():
         console.print(f"failed: {trial}, {method}: {reason}", markup=False, highlight=False, soft_wrap=True)
+    for trial in without_truth(records):
+        console.print(f"no ground truth: {trial}", markup=False, highlight=False, soft_wrap=True)
     console.print(f"Report: {page}", markup=False, highlight=False, soft_wrap=True)

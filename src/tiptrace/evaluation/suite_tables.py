@@ -280,10 +280,28 @@ def budget_table(budget: Mapping[str, Sequence[TrialRecord]]) -> Table:
 
 
 def failures_table(records: Sequence[TrialRecord]) -> Table:
-    """What gave no result, by name and reason."""
-    rows = [[r.trial, r.method, r.failure] for r in records if r.failure]
+    """What gave no result, by name and reason; methods that failed alike in a row of their own."""
+    alike: dict[tuple[str, str], list[str]] = defaultdict(list)
+    run: dict[str, int] = defaultdict(int)
+    for record in records:
+        run[record.trial] += 1
+        if record.failure:
+            alike[record.trial, record.failure].append(record.method)
+    rows = [
+        [trial, "all" if 1 < len(methods) == run[trial] else ", ".join(methods), reason]
+        for (trial, reason), methods in alike.items()
+    ]
     heads = (("trial", "trial"), ("method", "method"), ("reason", "reason"))
     return Table("failures", "Failures", columns(*heads), rows_of(rows))
+
+
+def without_truth(records: Sequence[TrialRecord]) -> list[str]:
+    """Trials that have results and nothing to hold them against, in order."""
+    measured = {r.trial: False for r in records if not r.failure}
+    for record in records:
+        if record.metrics is not None and record.metrics.evaluated_frames:
+            measured[record.trial] = True
+    return [trial for trial, known in measured.items() if not known]
 
 
 def outliers(

@@ -191,7 +191,14 @@ class _Writer:
         write_lines(self._made(layout.TASKS["v2.1"]), [{"task_index": 0, "task": self._task}])
         keys = ("episode_index", "tasks", "length")
         write_lines(self._made(layout.EPISODES["v2.1"]), [{k: row[k] for k in keys} for row in self._rows])
-        stats = [{"episode_index": k, "stats": stats} for k, stats in enumerate(self._stats)]
+        empty = {
+            n for n, s in layout.pooled(self._stats).items() if s["count"] == [0]
+        }  # lerobot divides by it
+        rows = [
+            {name: {**s, "count": [1]} if name in empty else s for name, s in stats.items()}
+            for stats in self._stats
+        ]
+        stats = [{"episode_index": k, "stats": row} for k, row in enumerate(rows)]
         write_lines(self._made(layout.EPISODES_STATS), stats)
 
     def _finish_v30(self) -> None:
