@@ -119,3 +119,18 @@ def test_dots_that_detection_misses_are_taken_from_the_untouched_gel():
     assert distance.min() < 0.5
     np.testing.assert_allclose(seeds.rest_px[distance.argmin()], rest[faint], atol=0.5)
     assert np.linalg.norm(seeds.markers.uv_px - seeds.rest_px - [4.0, -2.0], axis=1).max() < 0.5
+
+
+def test_a_patch_carried_by_more_than_half_a_pitch_keeps_its_dots():
+    rest = grid()
+    across = np.abs(rest[:, 1] - 120.0)
+    moved = rest + np.column_stack(
+        [-0.6 * 31.0 * np.clip(1.4 - across / 80.0, 0.0, 1.0), np.zeros(len(rest))]
+    )
+    moved = moved[moved[:, 0] > 8.0]
+    plain = np.full((H, W, 3), 120.0)
+    reference, image = (to_uint8(paint_dots(plain, uv, 10), 0.0, 0) for uv in (rest, moved))
+    seeds = seed(image, reference)
+    carried = seeds.markers.uv_px[:, 0] - seeds.rest_px[:, 0]
+    across = np.abs(seeds.markers.uv_px[:, 1] - 120.0)
+    assert np.abs(carried + 0.6 * 31.0 * np.clip(1.4 - across / 80.0, 0.0, 1.0)).max() < 0.6

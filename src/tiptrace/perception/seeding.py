@@ -19,7 +19,10 @@ from tiptrace.perception.markers import Markers, detect_cut_dots, detect_markers
 from tiptrace.perception.tracking import grey_image
 from tiptrace.types import FloatArray, Image
 
-_MATCH = 0.45  # of the pitch: largest displacement between untouched gel and first image, neighbours apart
+_STILL = (
+    0.25  # of the pitch: displacement since the untouched gel up to which the nearest dot is the right one
+)
+_MATCH = 0.45  # of the pitch: how differently from its neighbours a marker may have moved
 _NEIGHBOURS = 3
 
 
@@ -64,7 +67,7 @@ def seed(image: Image, reference: Image | None) -> Seeds:
         return Seeds(markers, markers.uv_px.copy(), Ghosts(detect_cut_dots(image), markers.uv_px))
     whole, cut = untouched
     pitch = _pitch(markers.uv_px)
-    rest, partner = _match(markers.uv_px, whole, _MATCH * pitch)
+    rest, partner = _match(markers.uv_px, whole, pitch)
     missing = np.setdiff1d(np.arange(len(whole)), partner)
     found, found_rest = _recover(image, markers, rest, whole[missing], pitch)
     if len(found):
@@ -88,14 +91,32 @@ def _untouched_dots(reference: Image | None) -> tuple[FloatArray, FloatArray] | 
         return None
 
 
-def _match(uv: FloatArray, whole: FloatArray, reach: float) -> tuple[FloatArray, NDArray[np.intp]]:
-    """Rest position of each marker (its own where none is near), and the partners taken."""
-    distance = np.linalg.norm(uv[:, None] - whole[None], axis=2)
-    nearest, back = distance.argmin(axis=1), distance.argmin(axis=0)
-    good = (back[nearest] == np.arange(len(uv))) & (distance.min(axis=1) < reach)
+def _match(uv: FloatArray, whole: FloatArray, pitch: float) -> tuple[FloatArray, NDArray[np.intp]]:
+    """Rest position of each marker (its own where none is near), and the partners taken.
+
+    Friction may carry a whole contact patch by more than half a pitch, where the nearest dot is the wrong one; but
+    neighbours move alike. The match grows over the grid from the markers that hardly moved.
+    """
+    distance = np.linalg.norm(uv[:, None] - whole[None], axis=2)  # (n, m)
+    partner = np.full(len(uv), -1, dtype=np.intp)
+    sure = distance.min(axis=1) < max(_STILL * pitch, float(distance.min()) + 1e-9)
+    partner[sure] = distance[sure].argmin(axis=1)
+    between = np.linalg.norm(uv[:, None] - uv[None], axis=2)
+    waiting = set(np.flatnonzero(~sure).tolist())
+    while waiting:
+        known = np.flatnonzero(partner >= 0)
+        i = min(waiting, key=lambda k: float(between[k, known].min()))
+        waiting.remove(i)
+        near = known[np.argsort(between[i, known])[:_NEIGHBOURS]]
+        expected = uv[i] - np.mean(uv[near] - whole[partner[near]], axis=0)
+        away = np.linalg.norm(whole - expected, axis=1)
+        away[partner[known]] = np.inf
+        if away.min() < _MATCH * pitch:
+            partner[i] = away.argmin()
+    matched = partner >= 0
     rest = uv.copy()
-    rest[good] = whole[nearest[good]]
-    return rest, nearest[good]
+    rest[matched] = whole[partner[matched]]
+    return rest, partner[matched]
 
 
 def _recover(
