@@ -27,7 +27,9 @@ COMMANDS = (
         "track",
         "depth",
     ),
+    *("setup", "doctor", "record", "live", "view", "ros2"),
     *("plan-anchor", "import-gel", "calibrate gel", "calibrate check", "calibrate tip"),
+    *("calibrate rig", "calibrate latency"),
 )
 
 
