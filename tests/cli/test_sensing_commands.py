@@ -103,8 +103,11 @@ def test_a_video_without_markers_or_no_video_is_refused(tmp_path: Path) -> None:
     writer.release()
     with pytest.raises(PerceptionError, match=r"blank\.avi: first frame: .*marker"):
         track(path, out=tmp_path / "tracks.csv")
-    with pytest.raises(PerceptionError, match="cannot be read as a video"):
+    with pytest.raises(PerceptionError, match=r"none\.avi: no such file"):
         track(tmp_path / "none.avi", out=tmp_path / "tracks.csv")
+    (tmp_path / "text.avi").write_text("no video")
+    with pytest.raises(PerceptionError, match="cannot be read as a video"):
+        track(tmp_path / "text.avi", out=tmp_path / "tracks.csv")
 
 
 @pytest.mark.parametrize("method", ["full", "paper"])

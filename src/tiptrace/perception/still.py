@@ -20,11 +20,13 @@ def read_image(path: Path) -> Image:
     """A colour image from a file, (H, W, 3) uint8 BGR.
 
     Raises:
-        PerceptionError: it cannot be read.
+        PerceptionError: no such file, or it cannot be read.
     """
+    if not path.is_file():  # OpenCV would print a warning of its own
+        raise PerceptionError(f"{path}: no such file; is the path right?")
     image = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if image is None:
-        raise PerceptionError(f"{path}: cannot be read as an image; is the path right?")
+        raise PerceptionError(f"{path}: cannot be read as an image; is the file complete?")
     return np.asarray(image, dtype=np.uint8)
 
 

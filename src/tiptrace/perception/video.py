@@ -41,8 +41,10 @@ class Video:
         """Open it.
 
         Raises:
-            PerceptionError: it cannot be read, or holds no frame.
+            PerceptionError: no such file, it cannot be read, or it holds no frame.
         """
+        if not path.is_file():  # OpenCV would print a warning of its own
+            raise PerceptionError(f"{path}: no such file; is the path right?")
         self.path = path
         capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
         self.fps = float(capture.get(cv2.CAP_PROP_FPS)) or 25.0
@@ -50,9 +52,7 @@ class Video:
         readable = capture.isOpened() and capture.read()[0]
         capture.release()
         if not readable:
-            raise PerceptionError(
-                f"{path}: cannot be read as a video; is the path right and the file complete?"
-            )
+            raise PerceptionError(f"{path}: cannot be read as a video; is the file complete?")
 
     def frames(self) -> Iterator[Image]:
         """Frames in order, (H, W, 3) uint8 BGR."""
