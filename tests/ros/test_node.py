@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.ros.environment import NEEDS_ROS, ROS_PYTHON, alone
 from tiptrace.config import dump_yaml
 from tiptrace.pipeline import open_tracer, trace
 from tiptrace.sim.spec import TrialSpec
@@ -21,14 +22,8 @@ from tiptrace.streams.simulated import SimulatedStream
 from tiptrace.streams.writer import RecordingWriter
 from tiptrace.types import SIDES
 
-ROS_PYTHON = os.environ.get("TIPTRACE_ROS_PYTHON", "")
 FRAMES = 150
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(
-        not ROS_PYTHON, reason="TIPTRACE_ROS_PYTHON names no Python with rclpy (docs/ros2.md)"
-    ),
-]
+pytestmark = NEEDS_ROS
 
 
 @pytest.fixture(scope="module")
@@ -53,11 +48,7 @@ def trial(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def answers(trial: Path) -> dict:
     """What the node published while another process played the recording."""
-    environment = os.environ | {
-        "ROS_DOMAIN_ID": str(100 + os.getpid() % 100),
-        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-        "OMP_NUM_THREADS": "1",
-    }
+    environment = alone()
     command = [
         ROS_PYTHON,
         "-m",
@@ -106,10 +97,31 @@ def test_frames_path_and_diagnostics(answers: dict) -> None:
     assert float(answers["diagnostics"][-1]["rate_hz"]) > 0
 
 
-def test_without_a_rig_one_sentence_and_exit_code_2(tmp_path: Path) -> None:
-    done = subprocess.run(
-        [ROS_PYTHON, "-m", "tiptrace", "ros2"], cwd=tmp_path, capture_output=True, text=True, timeout=120
-    )
-    assert done.returncode == 2
-    assert "rig is not set" in done.stderr
+def test_the_node_ends_quietly_on_an_interrupt(trial: Path, answers: dict) -> None:
+    assert "Traceback" not in trial.with_name("node.txt").read_text()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        ([], "rig is not set"),
+        (["-p", "rig:=none.yaml"], "none.yaml"),
+        (["-p", "rig:=3"], "parameter rig"),
+        (["-p", "queue_depth:=many"], "parameter queue_depth"),
+        (["-p", "wait_for_late_s"], "ROS arguments"),
+    ],
+)
+def test_wrong_parameters_are_one_sentence_and_exit_code_2(
+    arguments: list[str], sentence: str, tmp_path: Path
+) -> None:
+    command = [ROS_PYTHON, "-m", "tiptrace", "ros2", "--", "--ros-args", *arguments]
+    done = subprocess.run(command, cwd=tmp_path, env=alone(), capture_output=True, text=True, timeout=120)
+    assert done.returncode == 2, done.stderr
+    assert sentence in " ".join(done.stderr.split())
     assert "Traceback" not in done.stderr
+
+
+def test_whole_numbers_are_numbers(tmp_path: Path) -> None:
+    command = [ROS_PYTHON, "-m", "tiptrace", "ros2", "--", "--ros-args", "-p", "wait_for_late_s:=1"]
+    done = subprocess.run(command, cwd=tmp_path, env=alone(), capture_output=True, text=True, timeout=120)
+    assert "rig is not set" in done.stderr

@@ -19,6 +19,13 @@ ARGUMENTS = {  # name: (default, type, what it is)
     "phase_topic": ("", str, "String; default /trial/phase"),
     "opening_topic": ("", str, "Float64; default /gripper/opening"),
     "reliable": ("false", bool, "ask for reliable delivery"),
+    "queue_depth": ("10", int, "messages that each subscription holds"),
+    "wait_for_late_s": (
+        "0.0",
+        float,
+        "0 for live use; 0.25 waits for late samples, for bags",
+    ),
+    "path_length": ("5000", int, "poses that the path keeps"),
     "use_sim_time": ("false", bool, "take the time from /clock (ros2 bag play --clock)"),
 }
 

@@ -37,6 +37,7 @@ PARAMETERS: dict[str, Any] = {
     "wait_for_late_s": 0.0,
     "path_length": 5000,
 }
+_KINDS = {str: "text", bool: "true or false", int: "whole number", float: "number"}
 
 
 def run(arguments: Sequence[str], rig: Path | None = None) -> None:
@@ -51,10 +52,14 @@ def run(arguments: Sequence[str], rig: Path | None = None) -> None:
         ConfigError: a parameter or a settings file is wrong.
     """
     rclpy = load("rclpy")
-    rclpy.init(args=["tiptrace", *arguments])
+    try:
+        rclpy.init(args=["tiptrace", *arguments])
+    except Exception as error:  # noqa: BLE001  a class of rclpy's private extension
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise ConfigError(f"ROS arguments {' '.join(arguments)!r} are not understood: {reason}") from None
     node = rclpy.create_node("tiptrace")
     try:
-        values = {name: node.declare_parameter(name, default).value for name, default in PARAMETERS.items()}
+        values = _parameters(node)
         if rig is not None:
             values["rig"] = str(rig)
         _run(node, values)
@@ -64,6 +69,20 @@ def run(arguments: Sequence[str], rig: Path | None = None) -> None:
         node.destroy_node()
         if rclpy.ok():
             rclpy.shutdown()
+
+
+def _parameters(node: Any) -> dict[str, Any]:
+    """Values of all parameters, of the types of their defaults; a whole number is a number too."""
+    anything = load("rcl_interfaces.msg").ParameterDescriptor(dynamic_typing=True)
+    values = {}
+    for name, default in PARAMETERS.items():
+        value, kind = node.declare_parameter(name, default, anything).value, type(default)
+        if kind is float and type(value) is int:
+            value = float(value)
+        if type(value) is not kind:
+            raise ConfigError(f"parameter {name}: {value!r} is no {_KINDS[kind]}")
+        values[name] = value
+    return values
 
 
 def _run(node: Any, values: dict[str, Any]) -> None:
@@ -110,6 +129,8 @@ def _trial(node: Any, stream: RosStream, values: dict[str, Any], publishers: Pub
 def _spin(executor: Any, stream: RosStream) -> None:
     try:
         executor.spin()
+    except load("rclpy.executors").ExternalShutdownException:
+        pass  # SIGINT or SIGTERM: rclpy's own handler has shut the context down
     finally:
         stream.stop()
 
