@@ -10,10 +10,11 @@ BASE = {"types", "errors", "config"}
 MAY_IMPORT = {
     "types": {"config"},  # for annotations only
     "errors": set(),
+    "compiled": set(),
     "config": {"types", "errors", "geometry"},
     "geometry": {"types", "errors"},
-    "perception": BASE | {"geometry", "models"},
-    "estimation": BASE | {"geometry"},
+    "perception": BASE | {"compiled", "geometry", "models"},
+    "estimation": BASE | {"compiled", "geometry"},
     "calibration": BASE | {"geometry", "perception", "estimation"},
     "sim": BASE | {"geometry"},
     "evaluation": BASE | {"geometry"},

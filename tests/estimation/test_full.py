@@ -8,8 +8,11 @@ import numpy as np
 import pytest
 
 from tiptrace.config import Tool
+from tiptrace.estimation import kernels
 from tiptrace.estimation.anchor import TipPrior
 from tiptrace.estimation.full import FullConfig, FullEstimator
+from tiptrace.estimation.pads import PadMarkers
+from tiptrace.estimation.stage_one import StageOne
 from tiptrace.types import FingerMarkers, FloatArray, Phase, SensedPair, Status, TipEstimate
 
 from .synthetic import Synthetic, rig
@@ -273,3 +276,32 @@ def test_cost_per_frame_does_not_grow() -> None:
     assert len(estimator._track) < 1000
     assert len(estimator._reanchoring._rows) < 100
     assert len(estimator._reanchoring._segment) < 100
+
+
+def test_markers_that_a_window_no_longer_holds_are_not_divided_by() -> None:
+    config = FullConfig()
+    stage = StageOne(config.stage_one, config.patch, config.motion, config.tip_map, 0.05)
+    for k, pair in enumerate(Synthetic().pairs()[:8]):
+        markers = PadMarkers.of(pair)
+        gone = replace(markers, X=markers.X.copy(), x_S=markers.x_S.copy())
+        if k >= 4:  # some are never seen again
+            gone.X[:3] = gone.x_S[:3] = np.nan
+        stage.add(k, gone)
+    stage.keep_from(4)
+    with np.errstate(all="raise"):
+        weights = stage.trust()
+    assert not weights[:3].any()
+    assert weights.any()
+
+
+def test_a_trial_compiles_nothing_on_the_way() -> None:
+    estimator = FullEstimator(rig=rig())
+
+    def kinds() -> int:
+        functions = [f for f in vars(kernels).values() if hasattr(f, "nopython_signatures")]
+        return sum(len(f.nopython_signatures) for f in functions)
+
+    before = kinds()
+    assert before >= 5
+    run(estimator, Synthetic().pairs())
+    assert kinds() == before

@@ -25,6 +25,7 @@ from tiptrace.estimation.reanchor import ReanchorConfig, Reanchoring
 from tiptrace.estimation.stage_one import Anchoring, RunningTip, StageOne, StageOneConfig
 from tiptrace.estimation.tip_map import P, TipMapConfig
 from tiptrace.estimation.verdict import Verdict
+from tiptrace.estimation.warm_up import warm_up
 from tiptrace.types import Anchor, Event, FloatArray, Phase, PoseSample, SensedPair, Status, TipEstimate
 
 _TEMPLATE_FRAMES = 5
@@ -77,6 +78,7 @@ class FullEstimator:
             anchor_from: Replaces Stage I (``--anchor-from``). In the same grasp the other trial's
                 :attr:`anchoring`, whose marker template carries over; after a regrasp its :attr:`tip_E`, inflated.
         """
+        warm_up()  # the first frame should not wait
         self._config = c = config or FullConfig()
         self._latency = calibrated_latency(rig)
         self._prior = tip_prior(tool) if c.use_tip_prior else None
@@ -280,7 +282,7 @@ class FullEstimator:
     def _judge(self, markers: PadMarkers, motions: Motions, repeated: tuple[bool, bool]) -> Findings:
         assert self._anchoring is not None
         a = self._anchoring
-        residual = a.fit.residual(markers.X, motions)
+        residual = a.fit.residuals(markers.X[None], motions)[0]
         return self._monitor.judge(
             a.reference, motions, a.tip_map.c, residual, a.fit.twist(residual), repeated
         )

@@ -6,6 +6,7 @@ what the frame is worth.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import dataclass
 
@@ -93,7 +94,7 @@ def reference(
         normal_E: (3,) closing axis in F_E.
         staged: Whether the frames are a Stage I, which starts with the hand at rest.
     """
-    residual = np.stack([fit.residual(x, motions, k) for k, x in enumerate(X)])  # (T, N, 3)
+    residual = fit.residuals(X, motions)  # (T, N, 3)
     twists = np.array([fit.twist(r) for r in residual])
     axis = c_E - motions.centre.mean(axis=0)
     axis = axis / np.linalg.norm(axis)
@@ -158,10 +159,10 @@ class Monitor:
         """Whether each finger's frame equals the last one; call once per frame, first."""
         same = [False, False]
         if self._last_S is not None and self._last_S.shape == x_S.shape:
-            moved = np.abs(x_S - self._last_S).max(axis=1)  # (N,), NaN where lost
+            moved = np.abs(x_S - self._last_S)  # (N, 3), NaN where lost
             for k in (0, 1):
-                here = moved[(pad == k) & np.isfinite(moved)]
-                same[k] = len(here) > 0 and bool(here.max() < self._config.frozen_m)
+                most = np.fmax.reduce(moved[pad == k], axis=None, initial=np.nan)  # NaN if nothing is seen
+                same[k] = bool(most < self._config.frozen_m)
         self._last_S = x_S
         self._same = np.where(same, self._same + 1, 0)
         return same[0], same[1]
@@ -221,22 +222,24 @@ class Monitor:
         frames = _STILL_SLOW if ref.start_E is None else _STILL
         if len(self._path) < frames:
             return
-        path = np.stack(self._path)[-frames:]
+        path = np.array(list(self._path)[-frames:])
         along = path @ ref.axis_E  # (frames,)
-        across = path - np.outer(along, ref.axis_E)
-        half = across[-frames // 2 :].mean(axis=0) - across[: frames // 2].mean(axis=0)
+        across = path - along[:, None] * ref.axis_E
+        half = (across[frames // 2 :].sum(axis=0) - across[: frames // 2].sum(axis=0)) / (frames // 2)
         half -= (1.0 - _DEPTH_SHARE) * (half @ ref.normal_E) * ref.normal_E
-        swing = float(np.linalg.norm(half))
+        swing = math.sqrt(half @ half)
         if not self._contact:  # what moves against the hand is held by something
             back = self._free_m is not None and abs(float(along[-1]) - self._free_m) > c.regain_m
             self._contact = back or swing > 2.0 * c.still_across_m
             if self._contact:
                 self._path.clear()
             return
+        if np.ptp(along) >= c.still_axial_m or swing >= c.still_across_m:
+            return
         middle = np.median(path, axis=0)
         out = float(along.min() if frames == _STILL else np.median(along)) > ref.axial_m[1] + c.release_m
         hanging = _unloaded(middle, ref, c.unloaded_m) if out else self._as_before(middle)
-        if hanging and np.ptp(along) < c.still_axial_m and swing < c.still_across_m:
+        if hanging:
             self._contact, self._free_m, self._free_E = False, float(np.median(along)), middle
 
     def _as_before(self, D: FloatArray) -> bool:
@@ -257,8 +260,8 @@ class Monitor:
         last, self._last_residual = self._last_residual, residual_E
         if last is None or last.shape != residual_E.shape:
             return np.zeros(len(residual_E), dtype=bool)
-        step = np.linalg.norm(residual_E - last, axis=1)
-        return np.asarray(np.where(np.isfinite(step), step, 0.0) > self._config.jump_m)
+        step = residual_E - last
+        return np.asarray((step * step).sum(axis=1) > self._config.jump_m**2)  # False where lost
 
 
 def _unloaded(D: FloatArray, ref: Reference, limit_m: float) -> bool:

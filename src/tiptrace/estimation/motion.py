@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from tiptrace.estimation.robust import huber_weight
-from tiptrace.geometry.transforms import rotation_exp, skew
+from tiptrace.estimation.kernels import fit_frames, residuals_in_plane, turn_of
+from tiptrace.geometry.transforms import skew
 from tiptrace.types import FloatArray
 
 
@@ -84,7 +84,8 @@ class TemplateFit:
         self._all = M
         self.pad, self.axes, self.trust = pad, axes, trust  # as given, so that a fit can be made again
         self._active = np.flatnonzero(np.isfinite(M).all(axis=1) & (trust > 0))  # rows in use
-        self._M, self._trust, self._pad = M[self._active], trust[self._active], pad[self._active].astype(int)
+        self._M = np.ascontiguousarray(M[self._active])
+        self._trust, self._pad = trust[self._active], pad[self._active].astype(int)
         self._g = (
             np.average(self._M, axis=0, weights=self._trust) if len(self._M) else np.zeros(3)
         )  # centroid
@@ -92,12 +93,17 @@ class TemplateFit:
         self._sigma = np.array(
             [config.in_plane_sigma_m] * 2 + [np.hypot(config.depth_sigma_m, config.depth_bias_sigma_m)]
         )
-        self._whiten = (
+        self._whiten = np.ascontiguousarray(
             np.swapaxes(self._basis, 1, 2) / self._sigma[:, None]
         )  # (N, 3, 3): r_E → whitened (u, v, n)
         self._J = self._jacobian()  # (N, 3, 10) whitened
         self._JJ = np.einsum("nij,nik->njk", self._J, self._J).reshape(len(self._M), 100)
-        self._prior = np.diag([0.0] * 6 + [config.tilt_sigma_rad**-2] * 4)
+        # 1e-6 (σ of 1 krad, 1 km): a frame without markers stays solvable
+        self._prior = np.diag([1e-6] * 6 + [config.tilt_sigma_rad**-2] * 4)
+        self._normals = np.ascontiguousarray(self._basis[:, :, 2])
+        self._normal = self._normals[0] if len(self._M) else np.zeros(3)  # one axis for both pads
+        self._rows = [np.flatnonzero(self._pad == k) for k in (0, 1)]
+        self._on_pad = np.stack([self._pad == 0, self._pad == 1], axis=1).astype(np.float64)  # (n, 2)
 
     def _jacobian(self) -> FloatArray:
         """Whitened rows u, v, n against (ω, v, a_left, b_left, a_right, b_right)."""
@@ -128,56 +134,37 @@ class TemplateFit:
             X: (T, N, 3) markers in F_E, m, NaN where lost.
             start: Initial R (T, 3, 3) and t (T, 3); None: no motion.
         """
-        X = X[:, self._active]
-        T, N = X.shape[:2]
-        seen = np.isfinite(X[..., 0])  # (T, N)
-        X = np.where(seen[..., None], X, 0.0)
-        base: FloatArray = seen.astype(np.float64) * self._trust
-        R = np.tile(np.eye(3), (T, 1, 1)) if start is None else start[0]
-        t = np.zeros((T, 3)) if start is None else start[1]
-        weights = base.copy()
-        J_rows = self._J.reshape(3 * N, 10)
-        for _ in range(self._config.iterations):
-            z = self._whitened_residual(X, R, t)  # (T, N, 3)
-            H = (weights @ self._JJ).reshape(T, 10, 10) + self._prior
-            H[:, range(6), range(6)] += 1e-6  # (σ of 1 krad, 1 km): a frame without markers stays solvable
-            b = (weights[..., None] * z).reshape(T, 3 * N) @ J_rows  # (T, 10)
-            x = np.linalg.solve(H, b[..., None])[..., 0]
-            left = z - (x @ J_rows.T).reshape(T, N, 3)  # residual after this step
-            weights = base * huber_weight(np.sqrt(np.sum(left * left, axis=2)), self._config.huber)
-            g_t = R @ self._g + t
-            E = rotation_exp(x[:, :3])
-            R, t = E @ R, np.einsum("tij,tj->ti", E, t - g_t) + g_t + x[:, 3:6]
-        return self._result(R, t, H, left, weights, base)
-
-    def _whitened_residual(self, X: FloatArray, R: FloatArray, t: FloatArray) -> FloatArray:
-        """(T, N, 3) in the pads' axes over their sigmas."""
-        y = self._M @ np.swapaxes(R, 1, 2) + t[:, None]
-        r = (X - y)[..., None, :]  # (T, N, 1, 3)
-        return np.asarray((r @ np.swapaxes(self._whiten, 1, 2))[..., 0, :])
-
-    def _result(
-        self,
-        R: FloatArray,
-        t: FloatArray,
-        H: FloatArray,
-        left: FloatArray,
-        weights: FloatArray,
-        base: FloatArray,
-    ) -> Motions:
-        covariance = np.linalg.inv(H)[:, :6, :6]  # nuisances marginalised
+        X = np.ascontiguousarray(X[:, self._active])  # (T, n, 3)
+        T = len(X)
+        R = np.tile(np.eye(3), (T, 1, 1)) if start is None else np.array(start[0])
+        t = np.zeros((T, 3)) if start is None else np.array(start[1])
+        c = self._config
+        covariance, weights, squares = fit_frames(
+            X,
+            R,
+            t,
+            self._M,
+            self._whiten,
+            self._J,
+            self._JJ,
+            self._prior,
+            self._trust,
+            self._g,
+            c.huber,
+            c.iterations,
+        )
+        base = np.where(weights > 0, self._trust, 0.0)
+        sides = base @ self._on_pad  # (T, 2)
         total = np.maximum(base.sum(axis=1), 1e-9)
-        in_plane = np.sum(base * np.sum(left[..., :2] ** 2, axis=2), axis=1) / total
-        chi2 = np.sum(weights * np.sum(left * left, axis=2), axis=1) / np.maximum(3.0 * total - 6.0, 1.0)
         return Motions(
             R=R,
             t=t,
-            covariance=np.asarray(covariance, dtype=np.float64),
+            covariance=covariance,  # nuisances marginalised
             centre=R @ self._g + t,
-            residual_m=np.sqrt(in_plane) * self._sigma[0],
+            residual_m=np.sqrt(squares[:, 0] / total) * self._sigma[0],
             weights=self._scatter(weights),
-            chi2=chi2,
-            sides=np.stack([base @ (self._pad == 0), base @ (self._pad == 1)], axis=1),
+            chi2=squares[:, 1] / np.maximum(3.0 * total - 6.0, 1.0),
+            sides=sides,
         )
 
     def _scatter(self, values: FloatArray) -> FloatArray:
@@ -186,34 +173,23 @@ class TemplateFit:
         full[:, self._active] = values
         return full
 
-    def residual(self, X: FloatArray, motions: Motions, k: int = 0) -> FloatArray:
-        """In-plane residual of frame k in F_E, (N, 3) m; NaN where lost or not in use.
+    def residuals(self, X: FloatArray, motions: Motions) -> FloatArray:
+        """In-plane residuals in F_E, (T, N, 3) m; NaN where lost or not in use.
 
         Args:
-            X: (N, 3) markers of the frame in F_E.
-            motions: Fitted motions.
-            k: Frame.
+            X: (T, N, 3) markers in F_E.
+            motions: Fitted to them.
         """
-        out = np.full((len(self._all), 3), np.nan)
-        r = X[self._active] - (self._M @ motions.R[k].T + motions.t[k])
-        normal = self._basis[:, :, 2]
-        out[self._active] = r - np.sum(r * normal, axis=1, keepdims=True) * normal
+        out = np.full(X.shape, np.nan)
+        seen = np.ascontiguousarray(X[:, self._active])
+        out[:, self._active] = residuals_in_plane(seen, motions.R, motions.t, self._M, self._normals)
         return out
 
     def twist(self, residual_E: FloatArray) -> float:
-        """Rotation about the closing axis by which the left pad's markers lead the right's, rad."""
-        turn = [0.0, 0.0]
-        normal = self._basis[0, :, 2] if len(self._M) else np.zeros(3)  # one axis for both pads
-        r_all = residual_E[self._active]
-        for k in (0, 1):
-            here = (self._pad == k) & np.isfinite(r_all[:, 0])
-            if here.sum() < 3:
-                continue
-            x = self._M[here] - self._M[here].mean(axis=0)
-            r = r_all[here] - r_all[here].mean(axis=0)
-            around = np.cross(normal, x)
-            turn[k] = float(np.sum(around * r) / np.maximum(np.sum(around * around), 1e-12))
-        return turn[0] - turn[1]
+        """Rotation about the closing axis by which the left pad's markers lead the right's, (N, 3) m → rad."""
+        r = residual_E[self._active]
+        left, right = (turn_of(r, self._M, rows, self._normal) for rows in self._rows)
+        return left - right
 
     def refined_template(self, X: FloatArray, motions: Motions) -> FloatArray:
         """Mean of the frames carried back to the template, (N, 3); markers never seen stay."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tiptrace.geometry.transforms import apply
-from tiptrace.types import SIDES, FloatArray, SensedPair
+from tiptrace.types import FloatArray, SensedPair
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,12 +29,9 @@ class PadMarkers:
     @classmethod
     def of(cls, pair: SensedPair) -> PadMarkers:
         """Stack a pair."""
-        x_S = [pair.finger(s).markers.x_S for s in SIDES]
-        x_S = [
-            np.where(pair.finger(s).markers.tracked[:, None], x, np.nan)
-            for s, x in zip(SIDES, x_S, strict=True)
-        ]
-        X = np.concatenate([apply(pair.finger(s).T_E_S, x) for s, x in zip(SIDES, x_S, strict=True)])
-        axes = np.stack([pair.finger(s).T_E_S[:3, :3] for s in SIDES])
+        fingers = (pair.left, pair.right)
+        x_S = [np.where(f.markers.tracked[:, None], f.markers.x_S, np.nan) for f in fingers]
+        X = np.concatenate([apply(f.T_E_S, x) for f, x in zip(fingers, x_S, strict=True)])
+        axes = np.array([f.T_E_S[:3, :3] for f in fingers])
         pad = np.repeat([0, 1], [len(x) for x in x_S])
         return cls(X, np.concatenate(x_S), pad, axes)

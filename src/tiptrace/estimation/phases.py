@@ -43,7 +43,7 @@ class PhaseDetector:
             return Phase.RECONSTRUCTION
         if self._first is None:
             self._first = T_B_E[:3, :3]
-        self._turned = max(self._turned, _angle(self._first, T_B_E[:3, :3]))
+        self._turned = max(self._turned, float(_angle(self._first, T_B_E[:3, :3])))
         self._window.append((stamp_ns, T_B_E))
         while stamp_ns - self._window[0][0] > self._config.window_s * 1e9:
             self._window.popleft()
@@ -55,15 +55,19 @@ class PhaseDetector:
 
     def _set_off(self, T_B_E: FloatArray) -> int | None:
         """Stamp since which the hand travels without turning; None if it does not."""
+        stamps = [stamp for stamp, _ in reversed(self._window)]
+        T = np.array([T for _, T in reversed(self._window)])
+        turned = _angle(T[:, :3, :3], T_B_E[:3, :3]) > self._config.turn_rad
+        distances = np.linalg.norm(T[:, :3, 3] - T_B_E[:3, 3], axis=1)
         start, farthest = None, 0.0
-        for stamp, T in reversed(self._window):
-            if _angle(T[:3, :3], T_B_E[:3, :3]) > self._config.turn_rad:
+        for stamp, away, distance in zip(stamps, turned, distances.tolist(), strict=True):
+            if away:
                 break
-            distance = float(np.linalg.norm(T[:3, 3] - T_B_E[:3, 3]))
             if distance > farthest + 2e-5:
                 start, farthest = stamp, distance
         return start if farthest > self._config.travel_m else None
 
 
-def _angle(R_0: FloatArray, R_1: FloatArray) -> float:
-    return float(np.linalg.norm(rotation_log(R_0.T @ R_1)))
+def _angle(R_0: FloatArray, R_1: FloatArray) -> FloatArray:
+    """Angles between rotations (..., 3, 3) and one (3, 3), (...) rad."""
+    return np.asarray(np.linalg.norm(rotation_log(np.swapaxes(R_0, -1, -2) @ R_1), axis=-1))

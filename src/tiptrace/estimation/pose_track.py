@@ -6,6 +6,7 @@ there; a local quadratic through a window of samples has no such preference.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -13,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tiptrace.errors import GeometryError
-from tiptrace.geometry.transforms import rotation_exp, rotation_log, transform
+from tiptrace.estimation.kernels import smooth_poses
 from tiptrace.types import FloatArray, PoseSample
 
 _FEWEST = 4
@@ -78,7 +79,8 @@ class PoseTrack:
 
     def gap_s(self, stamp_ns: float) -> float:
         """Distance between the samples on either side of an instant, s."""
-        k = int(np.clip(np.searchsorted(self._stamps[: self._size], stamp_ns), 1, max(self._size - 1, 1)))
+        k = int(np.searchsorted(self._stamps[: self._size], stamp_ns))
+        k = min(max(k, 1), max(self._size - 1, 1))
         return float(self._stamps[k] - self._stamps[k - 1]) * 1e-9
 
     def at(self, stamps_ns: ArrayLike) -> HandStates:
@@ -97,33 +99,10 @@ class PoseTrack:
 
 def smooth_at(stamps_ns: FloatArray, T_B_E: FloatArray, at_ns: FloatArray, half_s: float) -> HandStates:
     """Local quadratic regression of poses (K,), (K, 4, 4) at instants (T,)."""
-    spacing = float(np.median(np.diff(stamps_ns[-64:]))) * 1e-9
+    steps = np.sort(np.diff(stamps_ns[-64:]))
+    spacing = 0.5 * float(steps[(len(steps) - 1) // 2] + steps[len(steps) // 2]) * 1e-9  # median
     half = max(half_s, 2.5 * spacing)
-    width = min(2 * int(np.ceil(half / spacing)) + 1, len(stamps_ns))
-    first = np.clip(np.searchsorted(stamps_ns, at_ns) - width // 2, 0, len(stamps_ns) - width)
-    index = first[:, None] + np.arange(width)  # (T, W)
-    x = (stamps_ns[index] - at_ns[:, None]) * 1e-9 / half  # (T, W)
-    weight = np.clip(1.0 - x * x, 1e-6, None)
-    R_ref = T_B_E[index[:, width // 2], :3, :3]  # (T, 3, 3)
-    R_rel = np.swapaxes(R_ref, 1, 2)[:, None] @ T_B_E[index, :3, :3]
-    y = np.concatenate(
-        [_small_log(R_rel), T_B_E[index, :3, 3] - T_B_E[index[:, :1], :3, 3]], axis=2
-    )  # (T, W, 6)
-    V = np.stack([np.ones_like(x), x, x * x], axis=2)  # (T, W, 3)
-    VW = V * weight[..., None]
-    N = np.swapaxes(VW, 1, 2) @ V + 1e-9 * np.eye(3)
-    beta = np.linalg.solve(N, np.swapaxes(VW, 1, 2) @ y)  # (T, 3, 6)
-    R = R_ref @ rotation_exp(beta[:, 0, :3])
-    t = beta[:, 0, 3:] + T_B_E[index[:, 0], :3, 3]
-    return HandStates(transform(R, t), beta[:, 1, 3:] / half, beta[:, 1, :3] / half)
-
-
-def _small_log(R: FloatArray) -> FloatArray:
-    """Rotation vectors; a cheap form where all rotations are small, (..., 3, 3) → (..., 3)."""
-    v = 0.5 * np.stack(
-        [R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], axis=-1
-    )
-    s2 = np.sum(v * v, axis=-1, keepdims=True)
-    if s2.max() > 0.04:
-        return rotation_log(R)
-    return np.asarray(v * (1.0 + s2 / 6.0 + 0.075 * s2 * s2))  # arcsin(s) / s
+    width = min(2 * math.ceil(half / spacing) + 1, len(stamps_ns))
+    first = np.searchsorted(stamps_ns, at_ns) - width // 2
+    first = np.minimum(np.maximum(first, 0), len(stamps_ns) - width)
+    return HandStates(*smooth_poses(stamps_ns, T_B_E, at_ns, first, width, half))

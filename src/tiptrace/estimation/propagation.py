@@ -11,7 +11,7 @@ import numpy as np
 
 from tiptrace.estimation.motion import Motions
 from tiptrace.estimation.pose_track import HandStates
-from tiptrace.estimation.tip_map import DRIFT, C, TipMap
+from tiptrace.estimation.tip_map import DRIFT, G_, C, TipMap
 from tiptrace.geometry.transforms import skew
 from tiptrace.types import FloatArray
 
@@ -53,19 +53,19 @@ def propagate(
     R, t = motions.R[k], motions.t[k]
     R_BE, t_BE = hand.T_B_E[0, :3, :3], hand.T_B_E[0, :3, 3]
     c_t = tip_map.c + phase * tip_map.drift
+    shown_at = R @ c_t + t
+    D = shown_at - c_t
     G_inv = np.linalg.inv(tip_map.G)
-    D = R @ c_t + t - c_t
     moved = G_inv @ D
     p_B = R_BE @ (c_t + moved) + t_BE
 
+    L = R_BE @ G_inv  # (3, 3) ∂p_B/∂D
     J = np.zeros((3, 19))  # ∂p_B/∂θ
-    J[:, C] = R_BE @ (np.eye(3) + G_inv @ (R - np.eye(3)))
-    for j in range(3):  # ∂(G⁻¹ D)/∂G_jk = −G⁻¹ e_j moved_k
-        J[:, 6 + 3 * j : 9 + 3 * j] = -np.outer(R_BE @ G_inv[:, j], moved)
+    J[:, C] = R_BE + L @ R - L
+    J[:, G_] = -(L[:, :, None] * moved).reshape(3, 9)  # ∂(G⁻¹ D)/∂G_jk = −G⁻¹ e_j moved_k
     J[:, DRIFT] = phase * J[:, C]
     # The estimate is stamped s − τ and the hand read there: a wrong τ only misplaces the in-grasp part, which the
     # caller adds from its rate.
-    B = np.concatenate([-skew(R @ c_t + t - motions.centre[k]), np.eye(3)], axis=1)  # (3, 6)
-    L = R_BE @ G_inv @ B
-    own = L @ motions.covariance[k] @ L.T + noise_m**2 * np.eye(3)
+    LB = np.concatenate([-L @ skew(shown_at - motions.centre[k]), L], axis=1)  # (3, 6) ∂p_B/∂(ω, v)
+    own = LB @ motions.covariance[k] @ LB.T + noise_m**2 * np.eye(3)
     return Tip(p_B, J @ tip_map.covariance @ J.T + own, D, moved, J, own)

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tiptrace.types import BoolArray, FloatArray
+from tiptrace.estimation.kernels import pattern_change
+from tiptrace.types import FloatArray
 
 BEFORE, AFTER = 10, 4  # frames compared
 _EARLIER = 4  # frames by which the kick may precede the new pattern
@@ -34,22 +35,9 @@ class SlipLevels:
 
 def kicks(D: FloatArray, normal_E: FloatArray) -> FloatArray:
     """Second differences of the tip's displacement in the hand, (T, 3) → (T − 2,) m."""
-    a = np.diff(D, n=2, axis=0)
+    a = D[2:] - 2.0 * D[1:-1] + D[:-2]
     a = a - (1.0 - _DEPTH_SHARE) * (a @ normal_E)[:, None] * normal_E
-    return np.asarray(np.linalg.norm(a, axis=1))
-
-
-def pattern_change(before: FloatArray, after: FloatArray) -> float:
-    """Root mean square over markers of the change of their mean residual, (n, N, 3), (m, N, 3) m → m."""
-    change, seen = _mean(after)[0] - _mean(before)[0], _mean(after)[1] & _mean(before)[1]
-    return float(np.sqrt(np.sum(change[seen] ** 2) / max(int(seen.sum()), 1)))
-
-
-def _mean(residual: FloatArray) -> tuple[FloatArray, BoolArray]:
-    finite: BoolArray = np.isfinite(residual[..., :1])  # (n, N, 1)
-    count = finite.sum(axis=0)
-    total = np.where(finite, residual, 0.0).sum(axis=0)
-    return total / np.maximum(count, 1), count[:, 0] > 0
+    return np.asarray(np.sqrt((a * a).sum(axis=1)))
 
 
 def slip_levels(D: FloatArray, residual: FloatArray, normal_E: FloatArray) -> SlipLevels:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tiptrace.perception.compiled import compiled
+from tiptrace.compiled import compiled
 from tiptrace.perception.fill import pull_push
 from tiptrace.types import BoolArray, FloatArray
 

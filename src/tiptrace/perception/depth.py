@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tiptrace.compiled import compiled
 from tiptrace.perception.background import untouched_background
-from tiptrace.perception.compiled import compiled
 from tiptrace.perception.fill import nearest_fill
 from tiptrace.perception.gel_model import GelModel
 from tiptrace.perception.markers import check_image

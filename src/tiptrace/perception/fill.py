@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tiptrace.compiled import compiled
 from tiptrace.errors import PerceptionError
-from tiptrace.perception.compiled import compiled
 from tiptrace.types import BoolArray
 
 Float32Map = NDArray[np.float32]

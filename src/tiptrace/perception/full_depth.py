@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tiptrace.compiled import compiled
 from tiptrace.errors import PerceptionError
 from tiptrace.perception.background import untouched_background
-from tiptrace.perception.compiled import compiled
 from tiptrace.perception.depth import DepthMap, untouched_of
 from tiptrace.perception.dot_fill import DotFill
 from tiptrace.perception.fill import pull_push

@@ -10,8 +10,8 @@ from typing import Any, Literal, get_args, get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
+from tiptrace.compiled import compiled
 from tiptrace.errors import PerceptionError
-from tiptrace.perception.compiled import compiled
 from tiptrace.perception.gel_graph import MAX_BYTES, check_graph
 from tiptrace.types import FloatArray, IntArray
 

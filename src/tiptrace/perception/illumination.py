@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tiptrace.perception.compiled import compiled
+from tiptrace.compiled import compiled
 from tiptrace.types import BoolArray, FloatArray
 
 Float32Map = NDArray[np.float32]

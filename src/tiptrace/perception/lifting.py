@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from tiptrace.compiled import compiled
 from tiptrace.errors import PerceptionError
-from tiptrace.perception.compiled import compiled
 from tiptrace.types import FloatArray
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tiptrace.perception.compiled import compiled
+from tiptrace.compiled import compiled
 from tiptrace.types import BoolArray, FloatArray
 
 _NEIGHBOURS = 8

@@ -8,8 +8,8 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
+from tiptrace.compiled import compiled
 from tiptrace.errors import PerceptionError
-from tiptrace.perception.compiled import compiled
 
 Float32Map = NDArray[np.float32]
 

@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tiptrace.compiled import compiled
 from tiptrace.perception.centroid import DotMeasurement, DotMeter
-from tiptrace.perception.compiled import compiled
 from tiptrace.perception.markers import Markers
 from tiptrace.perception.neighbourhood import Neighbourhood
 from tiptrace.perception.tracking import Grey, grey_image, lucas_kanade

@@ -1,4 +1,4 @@
-"""Loops over pixels and markers, compiled at their first call.
+"""Loops over pixels, markers and frames, compiled at their first call.
 
 Compiled loops run outside the interpreter's lock, so that two fingers keep two cores busy. The machine code is kept
 beside the module or in the user's cache folder; where neither can be written, each process compiles anew. Compiled
