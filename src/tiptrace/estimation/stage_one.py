@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from tiptrace.errors import GeometryError
 from tiptrace.estimation.anchor import TipPrior, covariance_from_information
+from tiptrace.estimation.grasp_slips import GraspSlipConfig, Parts, only
 from tiptrace.estimation.integrity import Reference, reference
 from tiptrace.estimation.motion import MotionConfig, Motions, TemplateFit
 from tiptrace.estimation.pads import PadMarkers
@@ -29,6 +31,7 @@ class StageOneConfig(BaseModel):
     memory_poses: int = Field(default=30000, ge=100)
     solve_frames: int = Field(default=250, ge=10)  # more are thinned out evenly
     template_rounds: int = Field(default=3, ge=1)
+    slips: GraspSlipConfig = GraspSlipConfig()
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +46,7 @@ class Anchoring:
     hand: HandStates | None
     reference: Reference
     start_ns: int
+    slips_ns: tuple[int, ...] = ()
 
     @property
     def tool_rotations(self) -> FloatArray:
@@ -143,7 +147,7 @@ class StageOne:
         good: BoolArray = motions.sides[:, 0] * motions.sides[:, 1] > 0
         if good.sum() < 3:
             raise GeometryError("Stage I has fewer than 3 frames with markers on both fingers")
-        motions, kept, X = _select(motions, good), stamps[good], X[good]
+        kept, X = stamps[good], X[good]
         phase = (kept - stamps[0]) * 1e-9 / duration - 1.0
         track = np.array([p.stamp_ns for p in self._poses], dtype=np.float64)
         T = np.array([p.T_B_E for p in self._poses])
@@ -153,12 +157,42 @@ class StageOne:
         def hand_at(latency_s: float) -> HandStates:
             return smooth_at(track, T, kept - latency_s * 1e9, self._half_s)
 
-        tip_map = solve_tip_map(
-            motions, hand_at, phase, duration, self._tip_map, latency, prior, self._normal, known
-        )
-        ref = reference(fit, X, motions, tip_map.c, self._normal)
+        def solution(p: Parts) -> TipMap:
+            return solve_tip_map(
+                p.motions,
+                hand_at,
+                phase,
+                duration,
+                self._tip_map,
+                latency,
+                prior,
+                self._normal,
+                known,
+                p.steps,
+            )
+
+        parts, tip_map = self._through_slips(Parts([fit], [only(motions, good)], [], X), solution)
+        ref = parts.reference(tip_map.c, self._normal)
         hand = hand_at(tip_map.latency_s)
-        return Anchoring(tip_map, fit, weights, kept, motions, hand, ref, int(stamps[0]))
+        slips = tuple(int(kept[k]) for k in parts.cuts)
+        return Anchoring(tip_map, parts.last, weights, kept, parts.motions, hand, ref, int(stamps[0]), slips)
+
+    def _through_slips(self, parts: Parts, solution: Callable[[Parts], TipMap]) -> tuple[Parts, TipMap]:
+        """Where residuals hang together and the markers' pattern changes, the tool slipped: cut there."""
+        c, tip_map = self._config.slips, solution(parts)
+        if tip_map.unrest < c.suspicion:
+            return parts, tip_map
+        first = tip_map.unrest
+        while len(parts.cuts) < c.most:
+            at = parts.next_cut(c)
+            if at is None:
+                break
+            further = parts.cut_at(at, self._motion)
+            better = solution(further)
+            if better.unrest > (c.relief * first if not parts.cuts else tip_map.unrest):
+                break
+            parts, tip_map = further, better
+        return parts, tip_map
 
     def assume(self, tip: TipPrior, latency: tuple[float, float] | None) -> Anchoring:
         """Stand-in for Stage I with a tip from elsewhere: the first frames only give the template."""
@@ -220,10 +254,6 @@ def _first_seen(X: FloatArray) -> FloatArray:
     total = np.maximum(seen.sum(axis=0), 1)[:, None]
     M = np.where(seen[..., None], head, 0.0).sum(axis=0) / total
     return np.asarray(np.where(np.any(seen, axis=0).reshape(-1, 1), M, np.nan))
-
-
-def _select(m: Motions, good: BoolArray) -> Motions:
-    return Motions(*(getattr(m, name)[good] for name in Motions.__slots__))
 
 
 class RunningTip:

@@ -48,6 +48,7 @@ class TipMap:
         duration_s: Length T_I of Stage I.
         residual: (T, 3) of ``D_t(c_t) − G u_t`` in F_E, m.
         checks: What Stage I says of itself; None without one.
+        rested: Share of frames in which the tip rested, as far as the solution can tell.
     """
 
     theta: FloatArray
@@ -59,6 +60,7 @@ class TipMap:
     duration_s: float
     residual: FloatArray
     checks: AnchorChecks | None = None
+    rested: float = 1.0
 
     @property
     def c(self) -> FloatArray:
@@ -81,6 +83,11 @@ class TipMap:
         return float(self.theta[15])
 
     @property
+    def unrest(self) -> float:
+        """How little a resting tip explains: correlation, more where frames had to be left out; 1 is right."""
+        return self.correlation * (1.0 + 20.0 * (1.0 - self.rested))
+
+    @property
     def drift(self) -> FloatArray:
         """(3,) displacement of the tip in the grasp over the length of Stage I, m."""
         return self.theta[DRIFT]
@@ -96,6 +103,7 @@ def solve_tip_map(
     prior: TipPrior | None = None,
     normal_E: FloatArray | None = None,
     known: TipMap | None = None,
+    steps: FloatArray | None = None,
 ) -> TipMap:
     """Tip, map, latency and drift from Stage I.
 
@@ -109,17 +117,18 @@ def solve_tip_map(
         prior: Known tip in F_E.
         normal_E: (3,) closing axis in F_E; None: x.
         known: An earlier map of the same gels, for the prior of G.
+        steps: (T, K) −1 before and 0 after each slip of the tool: the tip stood elsewhere in the grasp before.
 
     Raises:
         GeometryError: fewer than 3 frames.
     """
     normal = np.array([1.0, 0.0, 0.0]) if normal_E is None else normal_E
     latency = latency or (config.latency_s, config.latency_std_s)
-    solver = Solver(motions, hand_at, phase, config, latency, prior, normal)
+    solver = Solver(motions, hand_at, phase, config, latency, prior, normal, steps)
     if known is not None:
         solver.expect_map(known.G, known.covariance[G_, G_])
     theta = solver.start()
-    free = np.ones(SIZE, dtype=bool)
+    free = np.ones(solver.size, dtype=bool)
     free[DRIFT] = False
     learned_column = solver.moved(theta) > config.map_gate_m
     free[G_] = (np.tile(learned_column, 3) | DIAGONAL) & config.learn_map & bool(learned_column.any())
@@ -135,20 +144,22 @@ def solve_tip_map(
     candidate = solver.solve(best.theta, drifting)
     along = np.linalg.svd(normal[None])[2][1:]  # (2, 3) in the pads' plane: only there can a tool slip
     sigma = np.sqrt(np.diag(along @ candidate.covariance[DRIFT, DRIFT] @ along.T))
-    if np.any(np.abs(along @ candidate.drift) > config.drift_evidence * sigma):
+    if solver.stepped or np.any(np.abs(along @ candidate.drift) > config.drift_evidence * sigma):
         best = candidate
+        best.covariance[DRIFT, DRIFT] += solver.slips_ahead(best.theta)
     else:  # less drift than three sigmas may still be there
         best.covariance[DRIFT, DRIFT] = config.hidden_drift**2 * candidate.covariance[DRIFT, DRIFT]
     return TipMap(
-        best.theta,
-        best.covariance,
-        best.learned,
+        best.theta[:SIZE],
+        best.covariance[:SIZE, :SIZE],
+        best.learned[:SIZE],
         best.rms,
         best.factor,
         len(phase),
         duration_s,
         best.r,
         solver.checks(best),
+        float(np.mean(best.weights > 0.1)),
     )
 
 

@@ -44,7 +44,11 @@ class TipMapConfig(BaseModel):
     latency_gate_s: float = Field(default=0.010, gt=0)
     drift_sigma_m: float = Field(default=3e-3, gt=0)  # along the pads
     drift_normal_sigma_m: float = Field(default=1e-4, gt=0)  # across them, where the tool cannot slip
+    step_normal_sigma_m: float = Field(
+        default=3e-4, gt=0
+    )  # of a slip across the pads: depth is another afterwards
     hidden_drift: float = Field(default=0.3, ge=0)  # share of its σ that a drift without evidence still has
+    slip_again: float = Field(default=0.5, ge=0)  # of the slips in Stage I, per its length, in Stage II
     drift_evidence: float = Field(default=3.0, gt=0)  # sigmas
     pose_sigma_m: float = Field(default=4e-5, gt=0)  # of the tip through the smoothed hand pose
     model_sigma_m: float = Field(default=1e-4, gt=0)  # what a linear map leaves
@@ -94,22 +98,41 @@ class Solver:
         latency: tuple[float, float],
         prior: TipPrior | None,
         normal: FloatArray,
+        steps: FloatArray | None = None,
     ) -> None:
+        self._steps = np.zeros((len(phase), 0)) if steps is None else steps
+        self.size: int = SIZE + 3 * self._steps.shape[1]
         self._m, self._hand_at, self._phase, self._config = motions, hand_at, phase, config
         self._latency, self._prior = latency, prior
-        self._mean = np.concatenate([np.zeros(6), I9, [latency[0]], np.zeros(3)])
-        self._prior_P = np.zeros((SIZE, SIZE))  # of what has a prior; c and p have none here
+        self._mean = np.concatenate([np.zeros(6), I9, [latency[0]], np.zeros(self.size - 16)])
+        self._prior_P = np.zeros((self.size, self.size))  # of what has a prior; c and p have none here
         self._prior_P[G_, G_] = map_prior(config, normal)
         self._prior_P[TAU, TAU] = latency[1] ** 2
         across = np.outer(normal, normal)
-        self._prior_P[DRIFT, DRIFT] = (
-            config.drift_sigma_m**2 * (np.eye(3) - across) + config.drift_normal_sigma_m**2 * across
-        )
-        self._prior_N = np.zeros((SIZE, SIZE))
+        along = np.eye(3) - across
+        for k, part in enumerate(self._moving):
+            sigma = (config.drift_normal_sigma_m, config.step_normal_sigma_m)[k > 0]
+            self._prior_P[part, part] = config.drift_sigma_m**2 * along + sigma**2 * across
+        self._prior_N = np.zeros((self.size, self.size))
         self._weigh_priors()
         if prior is not None:
             self._mean[C] = prior.c
             self._prior_N[C, C] = np.linalg.inv(prior.covariance)
+
+    @property
+    def stepped(self) -> bool:
+        """Whether the tool slipped: a drift that hides behind the steps must stay free, or it is missed."""
+        return self.size > SIZE
+
+    def slips_ahead(self, theta: FloatArray) -> FloatArray:
+        """Covariance (3, 3) of the drift: a tool that slipped in Stage I slips on, as far and either way, m²."""
+        steps = theta[SIZE:].reshape(-1, 3)
+        return np.asarray(self._config.slip_again**2 * steps.T @ steps)
+
+    @property
+    def _moving(self) -> list[slice]:
+        """Where drift and steps stand among the unknowns."""
+        return [DRIFT] + [slice(k, k + 3) for k in range(SIZE, self.size, 3)]
 
     def _weigh_priors(self) -> None:
         self._prior_N[6:, 6:] = np.linalg.inv(self._prior_P[6:, 6:])
@@ -159,7 +182,7 @@ class Solver:
             N = np.einsum("tij,tik->jk", A, WA, optimize=True) + self._prior_N
             b = -np.einsum("tij,ti->j", WA, w) + self._prior_N @ (self._mean - theta)
             N_ff = N[np.ix_(index, index)]
-            step = np.zeros(SIZE)
+            step = np.zeros(self.size)
             step[index] = np.linalg.solve(N_ff + 1e-12 * np.diag(np.diag(N_ff)), b[index])
             misfit = w + A @ step
             k = np.einsum("tij,tj->ti", S_inv, misfit)
@@ -180,7 +203,8 @@ class Solver:
         """A (T, 3, 19), S⁻¹ (T, 3, 3), misclosure (T, 3), lever (T, 3) at the corrected motions."""
         m, T = self._m, len(self._phase)
         p, G, tau = theta[P], theta[G_].reshape(3, 3), float(theta[15])
-        c_t = theta[C] + self._phase[:, None] * theta[DRIFT]  # (T, 3)
+        shares = np.column_stack([self._phase, self._steps])  # (T, 1 + K)
+        c_t = theta[C] + shares @ theta[16:].reshape(-1, 3)  # (T, 3)
         hand = self._hand_at(tau)
         R_BE, t_BE = hand.T_B_E[:, :3, :3], hand.T_B_E[:, :3, 3]
         q = np.einsum("tji,tj->ti", R_BE, p - t_BE)  # resting tip in F_E
@@ -194,13 +218,14 @@ class Solver:
         B = np.concatenate([-skew(lever), np.broadcast_to(np.eye(3), (T, 3, 3))], axis=2)
         S = B @ m.covariance @ np.swapaxes(B, 1, 2)
         S[:, range(3), range(3)] += self._config.pose_sigma_m**2 + self._config.model_sigma_m**2
-        A = np.zeros((T, 3, SIZE))
+        A = np.zeros((T, 3, self.size))
         A[:, :, C] = R - np.eye(3) + G
         A[:, :, P] = -G @ np.swapaxes(R_BE, 1, 2)
         for j in range(3):
             A[:, j, 6 + 3 * j : 9 + 3 * j] = -u
         A[:, :, 15] = du_ds @ G.T
-        A[:, :, DRIFT] = self._phase[:, None, None] * A[:, :, C]
+        for k, part in enumerate(self._moving):
+            A[:, :, part] = shares[:, k, None, None] * A[:, :, C]
         r = y - c_t - u @ G.T
         return A, np.linalg.inv(S), r - np.einsum("tij,tj->ti", B, delta), lever
 
@@ -216,7 +241,7 @@ class Solver:
         f, h = np.flatnonzero(free), np.flatnonzero(~free)
         h = h[(h >= 6) & (h < 16)]  # a drift that no evidence speaks for is not considered
         P_ff = scaled_inverse(N[np.ix_(f, f)])
-        covariance = np.zeros((SIZE, SIZE))
+        covariance = np.zeros((self.size, self.size))
         covariance[np.ix_(f, f)] = P_ff
         if len(h):
             K = -P_ff @ N[np.ix_(f, h)]
@@ -277,9 +302,9 @@ class Solver:
         b = -np.einsum("tij,tik,tk->j", A, W, w, optimize=True) + self._prior_N @ (self._mean - best.theta)
         b[C] = -np.einsum("tij,tik,tk->j", A[:, :, C], W, w, optimize=True)
         inverse = scaled_inverse(N)
-        step = np.zeros(SIZE)
+        step = np.zeros(self.size)
         step[free] = inverse @ b[free]
-        here = np.flatnonzero(np.isin(free, np.arange(SIZE)[block]))
+        here = np.flatnonzero(np.isin(free, np.arange(self.size)[block]))
         return step, inverse[np.ix_(here, here)]
 
     def _spurious(self, S_inv: FloatArray, weights: FloatArray) -> FloatArray:
