@@ -72,14 +72,14 @@ def simulate(
 def _read_settings(path: Path | None) -> dict[str, Any]:
     if path is None:
         return {}
-    import yaml
-
+    from tiptrace.config import read_yaml
     from tiptrace.errors import ConfigError
 
     try:
-        values = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ConfigError(f"{path}: cannot be read as YAML ({str(error).splitlines()[0]})") from None
+        text = path.read_bytes()
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
+    values = read_yaml(text, str(path))
     if not isinstance(values, dict):
         raise ConfigError(f"{path}: expected settings of a trial, 'key: value', got {type(values).__name__}")
     return values
