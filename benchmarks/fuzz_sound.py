@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import fuzz_mutations
 import yaml
+from fuzz_models import weights_file
 
 from tiptrace.config import dump_yaml
 from tiptrace.sim.spec import TrialSpec
@@ -91,7 +91,7 @@ def make_sound(folder: Path) -> Sound:
     paths.model.write_bytes(model)
     cv2.imwrite(str(paths.reference), stream.references["left"])
     cv2.imwrite(str(paths.reference_right), stream.references["right"])
-    paths.weights.write_bytes(fuzz_mutations.weights_file())
+    paths.weights.write_bytes(weights_file())
     for path in paths.bags:
         _write_bag(paths.trial, path)
     return paths
