@@ -66,7 +66,7 @@ def answers(trial: Path) -> dict:
         node = subprocess.Popen(command, env=environment, stdout=said, stderr=said, start_new_session=True)
         try:
             player = [ROS_PYTHON, str(Path(__file__).with_name("player.py")), str(trial), str(out)]
-            subprocess.run(player, env=environment, check=True, timeout=240)
+            subprocess.run(player, env=environment, check=True, timeout=900)
             assert node.poll() is None, trial.with_name("node.txt").read_text()
         finally:
             os.killpg(node.pid, signal.SIGINT)

@@ -104,6 +104,10 @@ def _run(node: Any, values: dict[str, Any]) -> None:
         while not stream.stopped:
             publishers.begin()
             _trial(node, stream, values, publishers)
+    except Exception:
+        if node.context.ok():
+            raise
+        # interrupted between two messages: nothing can be published any more
     finally:
         stream.stop()
         executor.shutdown(timeout_sec=1.0)
