@@ -162,12 +162,13 @@ def _wait(pid: int, started: float) -> tuple[int, resource.struct_rusage]:
 
 
 def _sleeps(pid: int) -> bool:
-    """Neither running nor ready to (R), nor stopped from outside (T)."""
+    """Every thread waits: none runs or is ready to (R), is stopped from outside (T) or reads a disk (D)."""
     try:
-        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
-    except OSError:  # no /proc, or it has just ended
-        return True
-    return state not in "RTt"
+        threads = [task.read_text() for task in Path(f"/proc/{pid}/task").glob("*/stat")]
+    except OSError:  # one has just ended
+        return False
+    states = {thread.rpartition(")")[2].split()[0] for thread in threads}
+    return states <= {"S"}  # also where there is no /proc
 
 
 def _fault(code: int, said: str, cpu_s: float, memory_mb: float) -> str:
