@@ -43,7 +43,8 @@ def evaluate(folders: list[Path], out: Path, methods: list[str], workers: int) -
         store = SuiteStore(out / folder.name)
         store.claim({"methods": ",".join(methods), "analytic": "auto"})
         found, _ = recording_tasks([folder], None, "auto", None, {})
-        tasks = [replace(task, name=f"{folder.name}/{Path(task.name).stem}") for task in found]
+        level = folder.name.rsplit("-", 1)[0]  # a trial that fails does not come to tell its own
+        tasks = [replace(t, name=f"{folder.name}/{Path(t.name).stem}", level=level) for t in found]
         done = 0
 
         def report(task: object, folder: Path = folder, total: int = len(tasks)) -> None:

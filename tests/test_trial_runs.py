@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import numpy as np
 import pytest
 
 from tiptrace import trial_runs
 from tiptrace.evaluation.runner import TrialTask
+from tiptrace.evaluation.truth import Truth
 from tiptrace.sim.spec import make_spec
 from tiptrace.streams.simulated import SimulatedStream
 from tiptrace.tracer import METHODS, Sensing
 from tiptrace.trial_runs import run_trial, simulated_source
-from tiptrace.types import Observation, Phase, Sample, SensedPair, TruthSample
+from tiptrace.types import FloatArray, Observation, Phase, Sample, SensedPair, TipTrajectory, TruthSample
 
 SHORT = {"travel_m": 0.01, "fps": 5.0, "anchoring_s": 2.0, "mode": "markers", "level": "clean", "seed": 1}
 
@@ -77,3 +79,21 @@ def test_without_truth_the_oracle_fails_by_name_and_the_rest_goes_on(monkeypatch
     assert list(run.trajectories) == ["paper"]
     assert "needs a ground truth" in run.failures["ee-oracle"]
     assert run.truth is None
+
+
+def test_a_method_without_an_anchor_does_not_cost_the_others_their_analytic_truth(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    real = trial_runs.initial_point
+    asked: list[int] = []
+
+    def first_refused(trajectory: TipTrajectory, truth: Truth) -> tuple[FloatArray, FloatArray]:
+        asked.append(1)
+        return (np.full(3, np.nan),) * 2 if len(asked) == 1 else real(trajectory, truth)
+
+    monkeypatch.setattr(trial_runs, "initial_point", first_refused)
+    spec = make_spec(**SHORT).model_dump(mode="json", exclude_none=True)
+    source = simulated_source(spec, {"centreline": "T3"})
+    run = run_trial(TrialTask("short", source), ["full", "paper"])
+    assert run.analytic is not None
+    assert not run.failures

@@ -256,9 +256,14 @@ def _analytic(found: _Traced, truth: Truth | None, wanted: dict[str, Any], task:
         return None
     start = wanted.get("start_m")
     if start is None:
-        start = initial_point(trajectory, truth)[1] if truth is not None else np.full(3, np.nan)
-    if not np.isfinite(start).all():
-        raise ConfigError("an analytic ground truth needs a measured start: give --start x,y,z in metres")
+        if truth is None:
+            raise ConfigError("an analytic ground truth needs a measured start: give --start x,y,z in metres")
+        starts = (
+            initial_point(t, truth)[1] for t in found.trajectories.values()
+        )  # a refused method has none
+        start = next((s for s in starts if np.isfinite(s).all()), None)
+        if start is None:
+            return None
     end = max(e.stamp_ns for e in trajectory.estimates if e.phase is Phase.ANCHORING)
     yaw_rad = float(np.radians(wanted.get("yaw_deg", 0.0)))
     return Truth.from_samples(analytic_truth(CENTRELINES[name], start, found.poses, end, yaw_rad))
