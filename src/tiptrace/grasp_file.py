@@ -14,12 +14,13 @@ from tiptrace.errors import OutputError
 from tiptrace.estimation.anchor import TipPrior
 from tiptrace.estimation.integrity import Reference
 from tiptrace.estimation.motion import MotionConfig, TemplateFit
+from tiptrace.estimation.slip_detector import SlipLevels
 from tiptrace.estimation.stage_one import Anchoring
 from tiptrace.estimation.tip_map import C, TipMap
 from tiptrace.evaluation.atomic import write_atomic
 
 GRASP = "grasp.json"
-_FORMAT = "tiptrace-grasp/1"
+_FORMAT = "tiptrace-grasp/2"
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,11 +119,17 @@ def _grasp(record: dict[str, Any]) -> Grasp:
 
 def _plain(value: Any) -> Any:
     if isinstance(value, np.ndarray):
-        return {"array": value.tolist()}
+        return {"array": value.tolist(), "dtype": "int" if value.dtype.kind == "i" else "float"}
+    if isinstance(value, SlipLevels):
+        return {"slip": [value.kick_m, value.pattern_m]}
     return {"tuple": list(value)} if isinstance(value, tuple) else value
 
 
 def _array(value: Any) -> Any:
     if not isinstance(value, dict):
         return value
-    return np.array(value["array"], dtype=np.float64) if "array" in value else tuple(value["tuple"])
+    if "slip" in value:
+        return SlipLevels(*map(float, value["slip"]))
+    if "array" in value:
+        return np.array(value["array"], dtype=np.intp if value["dtype"] == "int" else np.float64)
+    return tuple(value["tuple"])

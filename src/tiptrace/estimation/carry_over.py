@@ -50,6 +50,7 @@ def carried_over(other: Anchoring, seen: StageOne, stamp_ns: int, config: Motion
     now = seen.first_fit()
     template, pad, trust = other.fit.template, other.fit.pad, other.trust
     M, weight = np.full_like(now.template, np.nan), np.zeros(len(now.template))
+    became = np.full(len(template), -1, dtype=np.intp)  # this recording's number of each of its markers
     wanted = matched = 0
     for k in (0, 1):
         old, new = np.flatnonzero(pad == k), np.flatnonzero(now.pad == k)
@@ -57,6 +58,7 @@ def carried_over(other: Anchoring, seen: StageOne, stamp_ns: int, config: Motion
         found = rows >= 0
         M[new[rows[found]]] = template[old[found]]
         weight[new[rows[found]]] = trust[old[found]]
+        became[old[found]] = new[rows[found]]
         wanted += int((trust[old] > 0).sum())
         matched += int((trust[old[found]] > 0).sum())
     if matched < max(_LEAST_MATCHED * wanted, 4):
@@ -65,7 +67,10 @@ def carried_over(other: Anchoring, seen: StageOne, stamp_ns: int, config: Motion
             "tool gripped anew (--regrasp), or the gel changed?"
         )
     fit = TemplateFit(M, now.pad, now.axes, weight, config)
-    return replace(other.carried_over(stamp_ns), fit=fit, trust=weight)
+    carried = other.carried_over(stamp_ns)
+    kept = became[carried.reference.rows]
+    reference = replace(carried.reference, rows=kept[kept >= 0])
+    return replace(carried, fit=fit, trust=weight, reference=reference)
 
 
 def _matches(old: FloatArray, new: FloatArray) -> IntArray:
