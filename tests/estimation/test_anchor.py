@@ -148,3 +148,12 @@ def test_pointer_poses_with_outliers_stay_at_the_published_tip(shared_data: Path
 def test_bad_poses_are_refused(R: FloatArray, t: FloatArray, sentence: str) -> None:
     with pytest.raises(GeometryError, match=sentence):
         fixed_point_ml(R, t)
+
+
+def test_poses_that_no_point_fits_are_refused_in_a_sentence(monkeypatch: pytest.MonkeyPatch):
+    def runs_away(*_: object) -> None:
+        raise np.linalg.LinAlgError("Singular matrix")
+
+    monkeypatch.setattr("tiptrace.estimation.anchor._Problem.step", runs_away)
+    with pytest.raises(GeometryError, match="no fixed point"):
+        fixed_point_ml(np.broadcast_to(np.eye(3), (5, 3, 3)), np.zeros((5, 3)), outliers=True)

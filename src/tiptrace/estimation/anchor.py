@@ -85,9 +85,19 @@ def fixed_point_ml(
         iterations: At most this many after the annealing.
 
     Raises:
-        GeometryError: fewer than 3 poses, or values that are not finite.
+        GeometryError: fewer than 3 poses, values that are not finite, or poses that no point fits.
     """
     problem = _Problem.of(R, t, covariance, centre, prior)
+    try:
+        return _solve(problem, outliers, iterations)
+    except np.linalg.LinAlgError:
+        raise GeometryError(
+            "the poses determine no fixed point: the solution runs away; was the tip at rest, and did the tool turn?"
+        ) from None
+
+
+def _solve(problem: _Problem, outliers: bool, iterations: int) -> FixedPointML:
+    """Weights and Gauss-Helmert steps in turn, until the point stays."""
     state = problem.start()
     scale = 1.0
     if outliers:
