@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Literal, cast
+from typing import Annotated
 
 import typer
+
+from tiptrace.cli.options import Depth, MapFile, ReferenceFrames, ReferenceLeft, ReferenceRight, RigFile
 
 
 def calibrate_latency(
@@ -17,18 +19,12 @@ def calibrate_latency(
     out: Annotated[
         Path | None, typer.Option(help="Write the rig with the latency here, e.g. rig.yaml.")
     ] = None,
-    rig: Annotated[
-        Path | None, typer.Option(help="rig.yaml to start from; default: the attached one.")
-    ] = None,
-    map_file: Annotated[
-        Path | None, typer.Option("--map", help="map.yaml of another bag; `tiptrace inspect` proposes one.")
-    ] = None,
-    reference_left: Annotated[Path | None, typer.Option(help="Image of the untouched left gel.")] = None,
-    reference_right: Annotated[Path | None, typer.Option(help="Image of the untouched right gel.")] = None,
-    reference_frames: Annotated[
-        str | None, typer.Option(help="Frames that show the untouched gel, e.g. 0:20.")
-    ] = None,
-    depth: Annotated[str, typer.Option(help="network, or none: without a calibrated gel.")] = "network",
+    rig: RigFile = None,
+    map_file: MapFile = None,
+    reference_left: ReferenceLeft = None,
+    reference_right: ReferenceRight = None,
+    reference_frames: ReferenceFrames = None,
+    depth: Depth = "network",
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a sentence.")] = False,
 ) -> None:
     """How much later than its exposure an image is stamped, against the robot's clock.
@@ -62,7 +58,7 @@ def calibrate_latency(
         reference_right=reference_right,
         reference_frames=reference_frames,
     )
-    sensing = Sensing(stream, SensingConfig(depth=cast(Literal["network", "none"], depth)))
+    sensing = Sensing(stream, SensingConfig(depth=depth))
     with progress_bar() as progress:
         task = progress.add_task(f"sensing {recording.name}", total=None)
         pairs = []

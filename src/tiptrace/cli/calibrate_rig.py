@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from tiptrace.cli.options import Depth, MapFile, ReferenceFrames, ReferenceLeft, ReferenceRight, RigFile
+
 if TYPE_CHECKING:
     from tiptrace.calibration.rig import RigCalibration
     from tiptrace.calibration.rig_data import Segment
@@ -20,18 +22,12 @@ def calibrate_rig(
         list[Path], typer.Argument(help="Recordings of the hand wiggling about a rod that is clamped.")
     ],
     out: Annotated[Path | None, typer.Option(help="Write the calibrated rig here, e.g. rig.yaml.")] = None,
-    rig: Annotated[
-        Path | None, typer.Option(help="rig.yaml to start from; default: the attached one.")
-    ] = None,
-    map_file: Annotated[
-        Path | None, typer.Option("--map", help="map.yaml of another bag; `tiptrace inspect` proposes one.")
-    ] = None,
-    reference_left: Annotated[Path | None, typer.Option(help="Image of the untouched left gel.")] = None,
-    reference_right: Annotated[Path | None, typer.Option(help="Image of the untouched right gel.")] = None,
-    reference_frames: Annotated[
-        str | None, typer.Option(help="Frames that show the untouched gel, e.g. 0:20.")
-    ] = None,
-    depth: Annotated[str, typer.Option(help="network, or none: without a calibrated gel.")] = "network",
+    rig: RigFile = None,
+    map_file: MapFile = None,
+    reference_left: ReferenceLeft = None,
+    reference_right: ReferenceRight = None,
+    reference_frames: ReferenceFrames = None,
+    depth: Depth = "network",
     pitch: Annotated[
         bool, typer.Option("--pitch/--no-pitch", help="Use marker_pitch_mm where the rig states it.")
     ] = True,
@@ -89,15 +85,13 @@ def calibrate_rig(
 
 def collect_wiggle(stream: Stream, name: str, depth: str, rig: Rig, on_pair: Any = None) -> Segment:
     """Sense a recording of a wiggle."""
-    from typing import Literal, cast
-
     from tiptrace.calibration.rig_data import WiggleCollector
     from tiptrace.perception.settings import SensingConfig
     from tiptrace.streams.synchronise import synchronise
     from tiptrace.tracer import Sensing
     from tiptrace.types import SIDES
 
-    sensing = Sensing(stream, SensingConfig(depth=cast(Literal["network", "none"], depth)))
+    sensing = Sensing(stream, SensingConfig(depth=depth))
     collector = WiggleCollector(name)
     for count, observation in enumerate(synchronise(stream), start=1):
         collector.add(observation, sensing(observation))

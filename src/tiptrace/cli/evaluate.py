@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from tiptrace.cli.options import MapFile, ReferenceFrames, RigFile
+
 _MOST_REPORTS = 5
 
 if TYPE_CHECKING:
@@ -58,13 +60,9 @@ def evaluate(
     start: Annotated[
         str | None, typer.Option(help="Measured start of the centreline: x,y,z in metres.")
     ] = None,
-    map_file: Annotated[
-        Path | None, typer.Option("--map", help="map.yaml for other people's recordings.")
-    ] = None,
-    rig: Annotated[Path | None, typer.Option(help="rig.yaml, in place of the attached ones.")] = None,
-    reference_frames: Annotated[
-        str | None, typer.Option(help="Frames that show the untouched gel, e.g. 0:20.")
-    ] = None,
+    map_file: MapFile = None,
+    rig: RigFile = None,
+    reference_frames: ReferenceFrames = None,
 ) -> None:
     """Evaluate methods over trials and write tables, figures and a report; continues where it was stopped.
 

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from tiptrace.cli.options import MapFile, ReferenceFrames, RigFile
+
 if TYPE_CHECKING:
     from tiptrace.export.dataset import Exported
     from tiptrace.types import Side
@@ -22,13 +24,9 @@ def export(
     to: Annotated[str, typer.Option(help="parquet, zarr or lerobot.")] = "parquet",
     out: Annotated[Path | None, typer.Option(help="File (parquet) or folder to write.")] = None,
     method: Annotated[str, typer.Option(help="For recordings; results have theirs.")] = "full",
-    map_file: Annotated[
-        Path | None, typer.Option("--map", help="map.yaml for other people's recordings.")
-    ] = None,
-    rig: Annotated[Path | None, typer.Option(help="rig.yaml, in place of the attached ones.")] = None,
-    reference_frames: Annotated[
-        str | None, typer.Option(help="Frames that show the untouched gel, e.g. 0:20.")
-    ] = None,
+    map_file: MapFile = None,
+    rig: RigFile = None,
+    reference_frames: ReferenceFrames = None,
     tool: Annotated[Path | None, typer.Option(help="tool.yaml, for a LeRobot dataset.")] = None,
     reference_left: Annotated[
         Path | None, typer.Option(help="Image of the untouched left gel, for a LeRobot dataset.")

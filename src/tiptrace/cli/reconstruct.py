@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from tiptrace.cli.options import Depth, MapFile, ReferenceFrames, ReferenceLeft, ReferenceRight
+
 if TYPE_CHECKING:
     from tiptrace.using import Using
 
@@ -45,15 +47,11 @@ def reconstruct(
     relative: Annotated[
         bool, typer.Option("--relative", help="No anchor at all: displacements from the first contact.")
     ] = False,
-    depth: Annotated[str, typer.Option(help="network, or none: without a calibrated gel.")] = "network",
-    map_file: Annotated[
-        Path | None, typer.Option("--map", help="map.yaml of another bag; `tiptrace inspect` proposes one.")
-    ] = None,
-    reference_left: Annotated[Path | None, typer.Option(help="Image of the untouched left gel.")] = None,
-    reference_right: Annotated[Path | None, typer.Option(help="Image of the untouched right gel.")] = None,
-    reference_frames: Annotated[
-        str | None, typer.Option(help="Frames of the bag whose mean is the untouched gel, e.g. 0:20.")
-    ] = None,
+    depth: Depth = "network",
+    map_file: MapFile = None,
+    reference_left: ReferenceLeft = None,
+    reference_right: ReferenceRight = None,
+    reference_frames: ReferenceFrames = None,
     stamps: Annotated[
         Literal["auto", "header", "log"], typer.Option(help="Clock that dates the messages.")
     ] = "auto",

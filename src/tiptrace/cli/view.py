@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from tiptrace.cli.options import MapFile
+
 if TYPE_CHECKING:
     from tiptrace.streams.foreign import ForeignRecording
     from tiptrace.streams.recording import Recording
@@ -30,7 +32,7 @@ def view(
     once: Annotated[bool, typer.Option("--once", help="End with the recording, in place of Ctrl-C.")] = False,
     rig: Annotated[Path | None, typer.Option(help="rig.yaml, in place of the attached one.")] = None,
     tool: Annotated[Path | None, typer.Option(help="tool.yaml, in place of the attached one.")] = None,
-    map_file: Annotated[Path | None, typer.Option("--map", help="map.yaml of another bag.")] = None,
+    map_file: MapFile = None,
 ) -> None:
     """Watch a recording: images with marker arrows, depth, the scene in 3-D, uncertainty, plots and events.
 

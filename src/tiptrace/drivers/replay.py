@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import csv
-import threading
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
-from tiptrace.drivers.base import Closing, DeviceHealth, DeviceStatus, PoseFrames, RobotSample, RobotTap, Wake
-from tiptrace.drivers.sample_queue import SampleQueue
+from tiptrace.drivers.base import DeviceStatus, PoseFrames, RobotTap, Wake
+from tiptrace.drivers.queued_robot import QueuedRobot
 from tiptrace.drivers.timeline import NS, Timeline
 from tiptrace.errors import DeviceError, GeometryError
 from tiptrace.geometry.transforms import rotation_from_quaternion, transform
@@ -20,7 +19,7 @@ _COLUMNS = ("stamp_ns", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 _REACH_M = 3.0
 
 
-class ReplayRobot(Closing):
+class ReplayRobot(QueuedRobot):
     """Poses of a csv or MCAP file, each at its time after the start.
 
     Args:
@@ -32,8 +31,7 @@ class ReplayRobot(Closing):
     """
 
     def __init__(self, path: Path, timeline: Timeline) -> None:
-        self.name = f"replay:{path}"
-        self._timeline = timeline
+        super().__init__(f"replay:{path}", timeline)
         if path.suffix == ".mcap":
             self._poses, base = _from_mcap(path)
         else:
@@ -41,9 +39,6 @@ class ReplayRobot(Closing):
         if len(self._poses) < 2:
             raise DeviceError(f"{path}: holds no poses to replay")
         self._frames = PoseFrames(base, None)
-        self._queue = SampleQueue(self.name, timeline)
-        self._stop = threading.Event()
-        self._thread: threading.Thread | None = None
 
     @property
     def frames(self) -> PoseFrames:
@@ -52,25 +47,8 @@ class ReplayRobot(Closing):
 
     def start(self, wake: Wake, tap: RobotTap | None = None) -> None:
         """Begin to play."""
-        self._queue.wake, self._queue.tap = wake, tap
-        self._thread = threading.Thread(target=self._run, name=self.name, daemon=True)
-        self._thread.start()
-        self._queue.first.wait(5.0)
-
-    def take(self) -> list[RobotSample]:
-        """Samples since the last call."""
-        return self._queue.take()
-
-    def health(self) -> DeviceHealth:
-        """State at this moment."""
-        return self._queue.health()
-
-    def close(self) -> None:
-        """Stop playing."""
-        self._stop.set()
-        if self._thread is not None:
-            self._thread.join(timeout=2.0)
-            self._thread = None
+        self._deliver_to(wake, tap)
+        self._begin(self._run, "")
 
     def _run(self) -> None:
         shift_ns = self._timeline.now_ns() - self._poses[0].stamp_ns

@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import importlib
-import threading
 from collections.abc import Callable
 from typing import Any
 from urllib.parse import parse_qs
 
 import numpy as np
 
-from tiptrace.drivers.base import Closing, DeviceHealth, PoseFrames, RobotSample, RobotTap, Wake
-from tiptrace.drivers.sample_queue import SampleQueue
+from tiptrace.drivers.base import PoseFrames, RobotTap, Wake
+from tiptrace.drivers.queued_robot import QueuedRobot
 from tiptrace.drivers.timeline import NS, ClockMap, Timeline
 from tiptrace.errors import ConfigError, DeviceError, GeometryError
 from tiptrace.geometry.transforms import rotation_from_quaternion, transform
 from tiptrace.types import FloatArray, OpeningSample, Phase, PhaseSample, PoseSample
 
-_FIRST_POSE_S = 5.0
 _TF_PERIOD_S = 0.01
 _OPENING_MAX_M = 0.3
 _FORM = "ros2, ros2:/POSE_TOPIC, with ?phase=/TOPIC&opening=/TOPIC, or ros2:tf?base=base&end_effector=tool0"
@@ -85,7 +83,7 @@ class TfLookup:
         return None if T is None else (stamp_ns(found.header.stamp), T)
 
 
-class Ros2Robot(Closing):
+class Ros2Robot(QueuedRobot):
     """The end effector's pose as ROS 2 publishes it.
 
     Args:
@@ -104,14 +102,11 @@ class Ros2Robot(Closing):
         known = {"phase", "opening", "base", "end_effector"}
         if set(options) - known or (topic and topic != "tf" and not topic.startswith("/")):
             raise ConfigError(f"robot {uri!r}: expected {_FORM}")
-        self.name, self._topic, self._options = uri, topic or "/ee_pose", options
+        super().__init__(uri, timeline)
+        self._topic, self._options = topic or "/ee_pose", options
         self._rclpy = load("rclpy")
-        self._timeline = timeline
-        self._queue = SampleQueue(uri, timeline)
         self._clock = ClockMap()
         self._base: str | None = options.get("base") if topic == "tf" else None
-        self._stop = threading.Event()
-        self._thread: threading.Thread | None = None
         self._last_tf = -1
 
     @property
@@ -121,7 +116,7 @@ class Ros2Robot(Closing):
 
     def start(self, wake: Wake, tap: RobotTap | None = None) -> None:
         """Subscribe and wait for the first pose."""
-        self._queue.wake, self._queue.tap = wake, tap
+        self._deliver_to(wake, tap)
         context = self._rclpy.Context()
         self._rclpy.init(context=context)
         try:
@@ -130,29 +125,10 @@ class Ros2Robot(Closing):
         except DeviceError:
             self._rclpy.shutdown(context=context)
             raise
-        self._thread = threading.Thread(target=self._spin, args=(context, node), name="ros2", daemon=True)
-        self._thread.start()
-        if not self._queue.first.wait(_FIRST_POSE_S):
-            self.close()
-            raise DeviceError(
-                f"{self.name}: no pose within {_FIRST_POSE_S:g} s on {self._topic}: is it published "
-                "(ros2 topic hz), in the same ROS_DOMAIN_ID?"
-            )
-
-    def take(self) -> list[RobotSample]:
-        """Samples since the last call."""
-        return self._queue.take()
-
-    def health(self) -> DeviceHealth:
-        """State at this moment."""
-        return self._queue.health()
-
-    def close(self) -> None:
-        """Unsubscribe."""
-        self._stop.set()
-        if self._thread is not None:
-            self._thread.join(timeout=3.0)
-            self._thread = None
+        self._begin(
+            lambda: self._spin(context, node),
+            f" on {self._topic}: is it published (ros2 topic hz), in the same ROS_DOMAIN_ID?",
+        )
 
     # --- the thread ----------------------------------------------------------------------------------------
 

@@ -6,15 +6,14 @@ import contextlib
 import importlib
 import socket
 import struct
-import threading
 import time
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 
-from tiptrace.drivers.base import Closing, DeviceHealth, DeviceStatus, PoseFrames, RobotSample, RobotTap, Wake
-from tiptrace.drivers.sample_queue import SampleQueue
+from tiptrace.drivers.base import DeviceStatus, PoseFrames, RobotTap, Wake
+from tiptrace.drivers.queued_robot import QueuedRobot
 from tiptrace.drivers.timeline import NS, ClockMap, Timeline
 from tiptrace.errors import ConfigError, DeviceError, MissingExtraError
 from tiptrace.geometry.transforms import rotation_exp, transform
@@ -22,14 +21,13 @@ from tiptrace.types import OpeningSample, PoseSample
 
 _PORT = 30004
 _REACH_S = 1.5
-_FIRST_POSE_S = 5.0
 _POLL_S = 0.0015
 _SILENCE_S = 0.5
 _BACK_OFF_S = (0.1, 1.0)
 _REGISTERS = (*range(12, 20), *range(36, 44))  # that the client can read
 
 
-class UrRobot(Closing):
+class UrRobot(QueuedRobot):
     """Poses of the active TCP in the controller's ``base`` frame, as RTDE sends them.
 
     What the receive interface cannot tell is whether the active TCP is the flange: the rig file has to say
@@ -49,15 +47,11 @@ class UrRobot(Closing):
             raise ConfigError(f"{uri}: names no robot; expected ur://HOST")
         self._host = parts.hostname
         self._register = _register(uri, parts.query)
-        self.name = f"ur://{self._host}"
+        super().__init__(f"ur://{self._host}", timeline)
         try:
             self._library: Any = importlib.import_module("rtde_receive")
         except ImportError:
             raise MissingExtraError("ur-rtde", "ur") from None
-        self._timeline = timeline
-        self._queue = SampleQueue(self.name, timeline)
-        self._stop = threading.Event()
-        self._thread: threading.Thread | None = None
         self._clock = ClockMap()
 
     @property
@@ -67,32 +61,9 @@ class UrRobot(Closing):
 
     def start(self, wake: Wake, tap: RobotTap | None = None) -> None:
         """Connect and wait for the first pose."""
-        self._queue.wake, self._queue.tap = wake, tap
+        self._deliver_to(wake, tap)
         receiver = self._connect()
-        self._thread = threading.Thread(
-            target=self._run, args=(receiver,), name=f"robot {self.name}", daemon=True
-        )
-        self._thread.start()
-        if not self._queue.first.wait(_FIRST_POSE_S):
-            self.close()
-            raise DeviceError(
-                f"{self.name}: connected, but no pose within {_FIRST_POSE_S:g} s: is the arm powered on?"
-            )
-
-    def take(self) -> list[RobotSample]:
-        """Samples since the last call."""
-        return self._queue.take()
-
-    def health(self) -> DeviceHealth:
-        """State at this moment."""
-        return self._queue.health()
-
-    def close(self) -> None:
-        """Disconnect."""
-        self._stop.set()
-        if self._thread is not None:
-            self._thread.join(timeout=3.0)
-            self._thread = None
+        self._begin(lambda: self._run(receiver), ", though connected: is the arm powered on?")
 
     # --- the thread ----------------------------------------------------------------------------------------
 
