@@ -5,7 +5,7 @@ from __future__ import annotations
 import platform
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Protocol
@@ -14,26 +14,21 @@ import numpy as np
 
 import tiptrace
 from tiptrace.estimation.full import FullEstimator
-from tiptrace.estimation.paper import PaperEstimator
 from tiptrace.estimation.smoothing import Recorded, smooth
 from tiptrace.evaluation.metrics import TrialMetrics, evaluate
 from tiptrace.evaluation.quality import Quality, assess
-from tiptrace.evaluation.report_data import AnchoringFit, MethodResult, ReportData, TactileView
+from tiptrace.evaluation.report_data import MethodResult, ReportData
 from tiptrace.evaluation.trial_report import write_trial_report
 from tiptrace.evaluation.truth import Truth
-from tiptrace.frames import FrameWatch, write_frames
+from tiptrace.frames import write_frames
 from tiptrace.grasp_file import GRASP, write_grasp
 from tiptrace.outputs import write_results
 from tiptrace.pipeline import STEPS, Step, open_tracer, replay, trace
 from tiptrace.streams.sync_report import SyncReport
 from tiptrace.tracer import TipTracer, TracerOptions, make_tracer, sensing_of
+from tiptrace.trial_watch import TrialWatch
 from tiptrace.types import (
-    SIDES,
-    FloatArray,
-    ImageSample,
-    Phase,
     SensedPair,
-    Side,
     Stream,
     TipTrajectory,
     TruthSample,
@@ -118,7 +113,7 @@ def reconstruct(
     using.check(method, tuple(beside))
     samples = stream.truth()
     truth = Truth.from_samples(samples) if samples else None
-    traced = _trace(stream, method, using, threads, _Watch(on_pair, bool(beside), report, on_step))
+    traced = _trace(stream, method, using, threads, TrialWatch(on_pair, bool(beside), report, on_step))
     watch, trajectory = traced.watch, traced.trajectory
     others = (MethodResult(m, _beside(stream, m, method, watch.pairs, truth, using)) for m in beside)
     methods = (MethodResult(method, trajectory), *others)
@@ -156,18 +151,18 @@ class _Traced:
 
     trajectory: TipTrajectory
     tracer: TipTracer
-    watch: _Watch
+    watch: TrialWatch
     notes: tuple[str, ...]
 
 
-def _trace(stream: Trial, method: str, using: Using, threads: bool, watch: _Watch) -> _Traced:
+def _trace(stream: Trial, method: str, using: Using, threads: bool, watch: TrialWatch) -> _Traced:
     """Trace a stream; where there turns out to be no Stage I at all, once more for displacements."""
     traced = _trace_once(stream, method, using.options(stream), using.smooth, threads, watch)
     anchored = using.tip or using.anchor_from or using.relative
     if method != "full" or anchored or watch.marked or _full(traced.tracer).anchoring is not None:
         return traced
     options = TracerOptions(depth=using.sensed_depth, use_stage_one=False, relative=True)
-    watch = _Watch(watch.on_pair, watch.keep_pairs, watch.keep_images, watch.on_step)
+    watch = TrialWatch(watch.on_pair, watch.keep_pairs, watch.keep_images, watch.on_step)
     again = _trace_once(stream, method, options, using.smooth, threads, watch)
     note = (
         "no phase marks and no anchoring motion: positions are displacements from the first contact; --tip or "
@@ -177,7 +172,7 @@ def _trace(stream: Trial, method: str, using: Using, threads: bool, watch: _Watc
 
 
 def _trace_once(
-    stream: Trial, method: str, options: TracerOptions, smoothed: bool, threads: bool, watch: _Watch
+    stream: Trial, method: str, options: TracerOptions, smoothed: bool, threads: bool, watch: TrialWatch
 ) -> _Traced:
     sync = SyncReport()
     opened = (
@@ -245,95 +240,3 @@ def _versions() -> dict[str, str]:
         "python": platform.python_version(),
         **{name: version(name) for name in libraries},
     }
-
-
-@dataclass
-class _Watch:
-    """Keeps what the report shows: step times, first and last pair, Stage I motions."""
-
-    on_pair: Callable[[int], None] | None
-    keep_pairs: bool
-    keep_images: bool
-    on_step: Callable[[Step], None] | None = None
-    tracer: TipTracer | None = None
-    times_ms: list[tuple[float, float, float]] = field(default_factory=list)
-    pairs: list[SensedPair] = field(default_factory=list)
-    frames: FrameWatch = field(default_factory=FrameWatch)
-    marked: bool = False
-    _first: tuple[Step, dict[Side, FloatArray | None]] | None = None
-    _last: Step | None = None
-    _motions: list[tuple[int, FloatArray, FloatArray]] = field(default_factory=list)
-
-    def show(self, step: Step) -> None:
-        """Keep what the report needs of a pair."""
-        self.times_ms.append(step.times_ms)
-        self.frames.show(step)
-        self.marked |= step.observation.phase is not None
-        if self.keep_pairs:
-            self.pairs.append(step.sensed)
-        if self._first is None and step.estimate.markers:
-            self._first = (step, {side: self._depth_mm(side) for side in SIDES})
-        self._last = step
-        self._keep_motion(step)
-        if self.on_pair is not None:
-            self.on_pair(len(self.times_ms))
-        if self.on_step is not None:
-            self.on_step(step)
-
-    def _keep_motion(self, step: Step) -> None:
-        assert self.tracer is not None
-        estimator = self.tracer.estimator
-        if isinstance(estimator, PaperEstimator) and step.estimate.phase is Phase.ANCHORING:
-            motion = estimator.motion
-            if motion is not None:
-                self._motions.append((step.estimate.stamp_ns, motion.R, motion.d))
-
-    def _depth_mm(self, side: Side) -> FloatArray | None:
-        assert self.tracer is not None
-        finger = self.tracer.sensing.fingers.get(side)
-        if not self.keep_images or finger is None or finger.depth_m is None:
-            return None
-        return finger.depth_m.astype(np.float64) * 1e3
-
-    def tactile(self) -> tuple[TactileView, ...]:
-        """Both fingers at the first and last pair; empty for streams without images."""
-        if self._first is None or self._last is None:
-            return ()
-        first, depth_first = self._first
-        views = []
-        for side in SIDES:
-            start, end = first.observation.finger(side).sample, self._last.observation.finger(side).sample
-            if not isinstance(start, ImageSample) or not isinstance(end, ImageSample):
-                return ()
-            uv_first = first.sensed.finger(side).markers.uv_px
-            views.append(
-                TactileView(
-                    side=side,
-                    first_image=start.image,
-                    last_image=end.image,
-                    uv_first_px=uv_first,
-                    uv_last_px=self._last.sensed.finger(side).markers.uv_px,
-                    selected=self._selected(side, 0 if uv_first is None else len(uv_first)),
-                    depth_first_mm=depth_first[side],
-                    depth_last_mm=self._depth_mm(side),
-                )
-            )
-        return tuple(views)
-
-    def _selected(self, side: Side, count: int) -> np.ndarray[Any, np.dtype[np.bool_]] | None:
-        assert self.tracer is not None
-        chosen = (
-            self.tracer.estimator.chosen.get(side)
-            if isinstance(self.tracer.estimator, PaperEstimator)
-            else None
-        )
-        return None if chosen is None else np.isin(np.arange(count), chosen)
-
-    def anchoring(self) -> AnchoringFit | None:
-        """Residuals of Stage I with the final anchor."""
-        anchor = self.tracer.anchor if self.tracer else None
-        if anchor is None or not self._motions:
-            return None
-        stamps, R, d = (np.asarray(values) for values in zip(*self._motions, strict=True))
-        rows = anchor.p_B - R @ anchor.p_B - d  # (n, 3) (I − R_t) p̂ − d_t
-        return AnchoringFit(stamps.astype(np.int64), np.linalg.norm(rows, axis=1) * 1e3)
