@@ -39,7 +39,8 @@ MAY_IMPORT = {
     "trial_plan": BASE | {"evaluation", "sim", "trial_runs"},
     "reconstruction": BASE
     | {"estimation", "evaluation", "geometry", "outputs", "pipeline", "streams", "tracer"}
-    | {"frames", "grasp_file", "using"},
+    | {"frames", "grasp_file", "trial_watch", "using"},
+    "trial_watch": BASE | {"estimation", "evaluation", "frames", "pipeline", "tracer"},
 }
 
 
