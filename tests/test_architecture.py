@@ -32,7 +32,18 @@ MAY_IMPORT = {
     "batch": BASE
     | {"batch_plan", "evaluation", "frames", "grasp_file", "outputs", "reconstruction", "streams"}
     | {"trial_runs", "using"},
-    "export": BASE | {"batch_plan", "frames", "geometry", "outputs", "pipeline", "streams", "tracer"},
+    "export": BASE
+    | {
+        "batch_plan",
+        "estimation",
+        "evaluation",
+        "frames",
+        "geometry",
+        "outputs",
+        "pipeline",
+        "streams",
+        "tracer",
+    },
     "live": BASE
     | {"geometry", "drivers", "streams", "perception", "estimation", "tracer", "pipeline", "calibration"},
     "ros": BASE | {"drivers", "geometry", "live", "pipeline", "streams"},
