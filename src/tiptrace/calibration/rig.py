@@ -8,19 +8,9 @@ from datetime import date
 import numpy as np
 
 from tiptrace.calibration.rig_data import Segment
+from tiptrace.calibration.rig_equations import POS, ROT, SIZE, TAU, K, SensorState
 from tiptrace.calibration.rig_pitch import pitch_scale
-from tiptrace.calibration.rig_solve import (
-    POS,
-    ROT,
-    SIZE,
-    TAU,
-    K,
-    Pitch,
-    SensorState,
-    Solution,
-    solve_rig,
-    start_state,
-)
+from tiptrace.calibration.rig_solve import Pitch, Solution, solve_rig, start_state
 from tiptrace.calibration.rig_start import check_arrangement, check_motion
 from tiptrace.config import Rig, Sensor, Sensors, Transform, TransformStd
 from tiptrace.errors import CalibrationError
