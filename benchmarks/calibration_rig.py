@@ -16,7 +16,8 @@ from tiptrace.errors import CalibrationError, ConfigError
 from tiptrace.geometry.transforms import rotation_log
 from tiptrace.sim.disturbances import LEVELS
 from tiptrace.sim.spec import make_spec
-from tiptrace.sim.wiggle import FAULTS, Wiggle, WiggleStream
+from tiptrace.sim.wiggle import Wiggle, WiggleStream
+from tiptrace.sim.wiring import FAULTS
 from tiptrace.streams.synchronise import synchronise
 from tiptrace.tracer import Sensing
 from tiptrace.types import SIDES

@@ -17,7 +17,8 @@ from tiptrace.errors import CalibrationError
 from tiptrace.geometry.transforms import rotation_log
 from tiptrace.sim.disturbances import Disturbances, MarkerNoise
 from tiptrace.sim.spec import make_spec
-from tiptrace.sim.wiggle import FAULTS, Fault, Wiggle, WiggleStream
+from tiptrace.sim.wiggle import Wiggle, WiggleStream
+from tiptrace.sim.wiring import FAULTS, Fault
 from tiptrace.streams.synchronise import synchronise
 from tiptrace.streams.writer import write_recording
 from tiptrace.tracer import Sensing

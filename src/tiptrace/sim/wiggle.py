@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any, Literal, get_args
+from typing import Any
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
@@ -27,6 +27,7 @@ from tiptrace.sim.spec import TrialSpec, make_spec
 from tiptrace.sim.tip import TipForce
 from tiptrace.sim.tools import ToolShape, make_tool
 from tiptrace.sim.trial import PLATE_ORIGIN_B, FrameState
+from tiptrace.sim.wiring import Fault, delivered, flipped, signs
 from tiptrace.types import (
     SIDES,
     FloatArray,
@@ -39,22 +40,6 @@ from tiptrace.types import (
     Sample,
     Side,
 )
-
-Fault = Literal[
-    "none",
-    "swapped",
-    "left-mirrored-x",
-    "left-mirrored-y",
-    "right-mirrored-x",
-    "right-mirrored-y",
-    "both-mirrored-x",
-    "both-mirrored-y",
-    "left-turned",
-    "both-turned",
-    "left-depth-inverted",
-    "poses-inverted",
-]
-FAULTS: tuple[Fault, ...] = get_args(Fault)
 
 _LEAD_S, _RAMP_S, _STEP_S = 0.4, 1.0, 0.02
 _OPENING_HZ = 10.0
@@ -138,7 +123,7 @@ class WiggleStream:
             return {}
         found = {side: gel.renderer.reference() for side, gel in self._gels.items()}
         return {
-            _delivered(side, self.wiggle.fault): _flipped(image, side, self.wiggle.fault)
+            delivered(side, self.wiggle.fault): flipped(image, side, self.wiggle.fault)
             for side, image in found.items()
         }
 
@@ -231,12 +216,12 @@ class WiggleStream:
     ) -> ImageSample | MarkerSample:
         d, fault, gel = self.spec.disturbed_by, self.wiggle.fault, self._gels[side]
         stamp = _ns(state.t_s + d.latency_s + d.jitter_s * jitter)
-        as_side = _delivered(side, fault)
+        as_side = delivered(side, fault)
         deformation = gel.deformation(state)
         if self.spec.mode == "markers":
             x_S = sensor.measure(gel.true_dots(deformation), state.t_s)
-            return MarkerSample(as_side, stamp, x_S * _signs(side, fault))
-        return ImageSample(as_side, stamp, _flipped(gel.image(deformation, state), side, fault))
+            return MarkerSample(as_side, stamp, x_S * signs(side, fault))
+        return ImageSample(as_side, stamp, flipped(gel.image(deformation, state), side, fault))
 
     def _poses(self, rng: np.random.Generator, t_0: float, t_1: float) -> Iterator[PoseSample]:
         """Reported poses in (t_0, t_1]."""
@@ -286,30 +271,6 @@ _NO_TIP = TipForce(
     where="free",
     stored_j=0.0,
 )
-
-
-def _delivered(side: Side, fault: Fault) -> Side:
-    """Under which name a sensor's data arrive."""
-    if fault != "swapped":
-        return side
-    return "right" if side == "left" else "left"
-
-
-def _signs(side: Side, fault: Fault) -> FloatArray:
-    """(3,) what a fault does to the markers of a side."""
-    if not fault.startswith((side, "both")):
-        return np.ones(3)
-    if fault.endswith("mirrored-x"):
-        return np.array([-1.0, 1.0, 1.0])
-    if fault.endswith("mirrored-y"):
-        return np.array([1.0, -1.0, 1.0])
-    return np.array([-1.0, -1.0, 1.0]) if fault.endswith("turned") else np.array([1.0, 1.0, -1.0])
-
-
-def _flipped(image: Image, side: Side, fault: Fault) -> Image:
-    x, y, _ = _signs(side, fault)
-    out = image[:, ::-1] if x < 0 else image
-    return np.ascontiguousarray(out[::-1] if y < 0 else out)
 
 
 def _ns(t_s: float) -> int:
