@@ -85,7 +85,10 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=30.0)
     parser.add_argument("--fault-seeds", type=int, default=1)
     args = parser.parse_args()
-    kinds = {"with the markers' pitch": [], "by motion alone": []}
+    kinds: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {
+        "with the markers' pitch": [],
+        "by motion alone": [],
+    }
     for seed in range(args.first, args.first + args.seeds):
         start = time.perf_counter()
         stream, segment = wiggle(seed, args.level, args.seconds)

@@ -20,6 +20,7 @@ from tiptrace.types import SIDES, FloatArray, Side
 WANTED_POS_M, WANTED_ROT_RAD, WANTED_SCALE = 0.3e-3, np.radians(0.5), 0.005
 _NOISY_M = 8e-5  # in-plane residual beyond which the rod did not stand still, or the markers slipped
 _CONTRADICTION = 3.5  # sigmas between scale by motion and by pitch
+_GAIN_LEFT_OUT, _LATENCY_LEFT_OUT_S = 0.008, 1.2e-3  # what a gel that is not linear adds to their errors
 _AXES = ("x", "y", "z")
 
 
@@ -114,7 +115,7 @@ def _sensor(side: Side, n: int, solution: Solution, rig: Rig, segments: list[Seg
     sigma = np.sqrt(np.diag(solution.covariance))[n * SIZE : (n + 1) * SIZE]
     old = rig.sensor(side)
     T_old, mm = old.T_E_S.matrix(), np.array(old.mm_per_px) / state.k
-    gain, gain_std = state.g.copy(), state.g * sigma[8:11]
+    gain, gain_std = state.g.copy(), np.hypot(state.g * sigma[8:11], _GAIN_LEFT_OUT)
     if not all(s.pads[side].has_depth for s in segments):
         gain[2] = gain_std[2] = np.nan
     return SensorCalibration(
@@ -127,7 +128,7 @@ def _sensor(side: Side, n: int, solution: Solution, rig: Rig, segments: list[Seg
         gain=gain,
         gain_std=gain_std,
         latency_s=state.latency_s,
-        latency_std_s=float(sigma[TAU]),
+        latency_std_s=float(np.hypot(sigma[TAU], _LATENCY_LEFT_OUT_S)),
         turned_rad=rotation_log(T_old[:3, :3].T @ state.T_E_S[:3, :3]),
         shifted_m=T_old[:3, :3].T @ (state.T_E_S[:3, 3] - T_old[:3, 3]),
         scaled=1.0 / state.k,
@@ -154,7 +155,7 @@ def _written(rig: Rig, sensors: dict[Side, SensorCalibration]) -> Rig:
             "T_E_S_std": std,
             "mm_per_px": (float(s.mm_per_px[0]), float(s.mm_per_px[1])),
             "latency_s": s.latency_s,
-            "latency_std_s": max(s.latency_std_s, 1e-4),
+            "latency_std_s": s.latency_std_s,
             "calibrated": date.today().isoformat(),
         }
         new[side] = rig.sensor(side).model_copy(update=update)
