@@ -7,15 +7,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from tiptrace.calibration.rig import RigCalibration, calibrate_rig
 from tiptrace.calibration.rig_data import PadTrack, Segment, WiggleCollector
 from tiptrace.calibration.rig_pitch import pitch_scale
 from tiptrace.calibration.rig_start import check_arrangement
+from tiptrace.cli import app
 from tiptrace.config import Rig, load_yaml
 from tiptrace.errors import CalibrationError
 from tiptrace.geometry.transforms import rotation_log
-from tiptrace.sim.disturbances import Disturbances, MarkerNoise
+from tiptrace.sim.disturbances import LEVELS, Disturbances, MarkerNoise
 from tiptrace.sim.spec import make_spec
 from tiptrace.sim.wiggle import Wiggle, WiggleStream
 from tiptrace.sim.wiring import FAULTS, Fault
@@ -122,6 +124,29 @@ def test_wrong_connections_are_told(fault: Fault) -> None:
 @pytest.mark.parametrize("fault", FAULTY)
 def test_every_wrong_connection_is_told(fault: Fault) -> None:
     _check_fault(fault)
+
+
+@pytest.mark.slow
+def test_rendered_images_give_the_rig(tmp_path: Path) -> None:
+    """The whole way of a user: images to MCAP, the packaged gel network, a rig file."""
+    disturbances = LEVELS["nominal"].model_copy(update={"mm_per_px": 0.02, "shown_shear": 0.85})
+    spec = make_spec(seed=5, disturbances=disturbances)
+    stream, recording, out = (
+        WiggleStream(Wiggle(duration_s=24.0), spec),
+        tmp_path / "w.mcap",
+        tmp_path / "rig.yaml",
+    )
+    write_recording(recording, stream)
+    result = CliRunner().invoke(app, ["calibrate", "rig", str(recording), "--out", str(out)])
+    assert result.exit_code == 0
+    assert "[mm]" in result.output
+    for side in SIDES:
+        found, true = load_yaml(Rig, out).sensor(side), stream.true_rig.sensor(side)
+        T, T_true = found.T_E_S.matrix(), true.T_E_S.matrix()
+        assert np.linalg.norm(T[:3, 3] - T_true[:3, 3]) < 0.3e-3
+        assert np.degrees(np.linalg.norm(rotation_log(T_true[:3, :3].T @ T[:3, :3]))) < 0.5
+        np.testing.assert_allclose(found.mm_per_px, true.mm_per_px, rtol=0.005)
+        assert found.latency_s == pytest.approx(disturbances.latency_s, abs=3e-3)
 
 
 def _check_fault(fault: Fault) -> None:

@@ -121,6 +121,7 @@ def _untouched(stream: Stream) -> dict[Side, FloatArray]:
 def _print(result: RigCalibration, old: Rig) -> None:
     import numpy as np
     from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
 
     table = Table(title="Rig calibration: new value ± σ (change)")
@@ -133,21 +134,21 @@ def _print(result: RigCalibration, old: Rig) -> None:
         change = t_mm - np.array(before.T_E_S.translation_m) * 1e3
         for k, axis in enumerate("xyz"):
             value = f"{t_mm[k]:.2f} ± {spread[k]:.2f} ({change[k]:+.2f})"
-            rows.setdefault(f"T_E_S translation {axis}_E [mm]", []).append(value)
+            rows.setdefault(f"T_E_S, {axis}_E [mm]", []).append(value)
         for k, axis in enumerate("xyz"):
             value = f"{np.degrees(s.turned_rad[k]):+.2f} ± {np.degrees(s.rotation_std_rad[k]):.2f}"
-            rows.setdefault(f"T_E_S turned about {axis}_S [°]", []).append(value)
+            rows.setdefault(f"turned about {axis}_S [°]", []).append(value)
         for k, axis in enumerate("xy"):
             value = f"{s.mm_per_px[k]:.5f} ± {s.mm_per_px_std[k]:.5f} ({s.scaled[k] - 1:+.2%})"
             rows.setdefault(f"mm per px, {axis}", []).append(value)
         for k, axis in enumerate(("shear x", "shear y", "depth")):
             value = f"{s.gain[k]:.3f} ± {s.gain_std[k]:.3f}" if np.isfinite(s.gain[k]) else "not measured"
-            rows.setdefault(f"gel shows of its {axis}", []).append(value)
+            rows.setdefault(f"gel shows of {axis}", []).append(value)
         was = "unknown" if before.latency_s is None else f"{before.latency_s * 1e3:.1f}"
         value = f"{s.latency_s * 1e3:.1f} ± {s.latency_std_s * 1e3:.1f} (was {was})"
         rows.setdefault("latency [ms]", []).append(value)
     for name, cells in rows.items():
-        table.add_row(name, *cells)
+        table.add_row(escape(name), *cells)
     console = Console(highlight=False, soft_wrap=True)
     console.print(table)
     console.print(f"markers follow the rod to {result.residual_m * 1e3:.3f} mm")

@@ -90,6 +90,7 @@ def _as_dict(result: TipCalibration) -> dict[str, object]:
 def _print(result: TipCalibration) -> None:
     import numpy as np
     from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
 
     pivot, paper = result.pivot, result.paper
@@ -100,7 +101,7 @@ def _print(result: TipCalibration) -> None:
         f"rotation up to {result.rotation_deg:.1f}°"
     )
     for column in ("", "x [mm]", "y [mm]", "z [mm]", "residual rms [mm]"):
-        table.add_column(column, justify="right" if column else "left")
+        table.add_column(escape(column), justify="right" if column else "left")
     rms = f"{result.residual_m * 1e3:.3f}"
     table.add_row("tip c ± σ, tool frame", *_pm(result.tip, std_mm[:3]), rms)
     table.add_row("fixed point p ± σ, base frame", *_pm(result.point, std_mm[3:]), rms)
