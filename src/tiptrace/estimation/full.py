@@ -252,7 +252,7 @@ class FullEstimator:
             )
             return estimate
         tip = self._propagate(pair.stamp_ns, motions, hand)
-        status, extra = self._verdict.of(stamp_ns, self._judge(markers, motions, repeated))
+        status, extra = self._verdict.of(stamp_ns, self._judge(markers, motions, hand, repeated))
         self._report_step(pair.stamp_ns, motions, hand, extra)
         R_B_E = hand.T_B_E[0, :3, :3] @ motions.R[0]
         estimate = replace(estimate, status=status, R_B_E=R_B_E, residual_m=float(motions.residual_m[0]))
@@ -279,12 +279,14 @@ class FullEstimator:
         late = a.tip_map.covariance[15, 15] * np.outer(v, v)
         return replace(tip, covariance=tip.covariance + late)
 
-    def _judge(self, markers: PadMarkers, motions: Motions, repeated: tuple[bool, bool]) -> Findings:
+    def _judge(
+        self, markers: PadMarkers, motions: Motions, hand: HandStates, repeated: tuple[bool, bool]
+    ) -> Findings:
         assert self._anchoring is not None
         a = self._anchoring
         residual = a.fit.residuals(markers.X[None], motions)[0]
         return self._monitor.judge(
-            a.reference, motions, a.tip_map.c, residual, a.fit.twist(residual), repeated
+            a.reference, motions, a.tip_map.c, hand.T_B_E[0], residual, a.fit.twist(residual), repeated
         )
 
     def _displacement(self, estimate: TipEstimate, tip: Tip, extra: FloatArray) -> TipEstimate:

@@ -11,12 +11,15 @@ from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
 
 from tiptrace.estimation.kernels import pattern_change
 from tiptrace.types import FloatArray
 
 BEFORE, AFTER = 10, 4  # frames compared
+HOLD = 6  # frames from a suspected slip until it is told
 _EARLIER = 4  # frames by which the kick may precede the new pattern
+_MOST = 3.0  # that one sign counts
 _DEPTH_SHARE = 0.3  # of a kick along the closing axis, which depends on depth and is noisier
 
 
@@ -51,46 +54,77 @@ def slip_levels(D: FloatArray, residual: FloatArray, normal_E: FloatArray) -> Sl
     return SlipLevels(float(np.percentile(kicks(D, normal_E), 98)), float(np.percentile(patterns, 75)))
 
 
+class SlipLimits(BaseModel):
+    """What makes a slip. Its signs are each in units of these, or of what Stage I showed where that is more."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    kick_m: float = Field(default=1.0e-3, gt=0)  # second difference of the tip's displacement
+    least_kick_m: float = Field(default=9.0e-4, gt=0)
+    pattern_m: float = Field(default=4.0e-5, gt=0)  # change of the markers' residuals, rms
+    pattern_alone_m: float = Field(default=8.0e-4, gt=0)  # the same, without a kick
+    pushed_m: float = Field(default=5.0e-4, gt=0)  # of the tip into the surface, as it seems
+    margin: float = Field(default=1.3, ge=1)  # over what Stage I showed
+    evidence: float = Field(default=1.25, gt=0)  # product of the three signs
+
+
 class SlipDetector:
     """Frame after frame, in constant memory."""
 
-    def __init__(self, kick_m: float, pattern_m: float, pattern_alone_m: float, margin: float) -> None:
-        """Set the limits.
-
-        Args:
-            kick_m: Least kick of a slip.
-            pattern_m: Least change of pattern.
-            pattern_alone_m: Change of pattern that needs no kick.
-            margin: A slip exceeds what Stage I showed by this factor.
-        """
-        self._kick_m, self._pattern_m, self._alone_m, self._margin = (
-            kick_m,
-            pattern_m,
-            pattern_alone_m,
-            margin,
-        )
+    def __init__(self, limits: SlipLimits) -> None:
+        self._limits = limits
         self._D: deque[FloatArray] = deque(maxlen=BEFORE + AFTER)
         self._residual: deque[FloatArray] = deque(maxlen=BEFORE + AFTER)
+        self._suspected = 0  # frames to go until a suspected slip is told
 
-    def update(self, D: FloatArray, residual: FloatArray, normal_E: FloatArray, usual: SlipLevels) -> bool:
-        """Whether the tool has slipped within the last frames.
+    def update(
+        self,
+        D: FloatArray,
+        residual: FloatArray,
+        pushed_m: float,
+        normal_E: FloatArray,
+        usual: SlipLevels,
+        held: bool = True,
+    ) -> bool:
+        """Whether the tool has slipped lately; told a few frames late, when no loss of contact explains the kick.
 
         Args:
             D: (3,) displacement of the tip in the hand, m.
             residual: (N, 3) markers less their fitted places, NaN where lost or unused.
+            pushed_m: How far the tip seems to have gone into the surface within the last frames.
             normal_E: (3,) closing axis.
             usual: What Stage I showed.
+            held: Whether the tip touches, and not only just again: letting go and landing kick it, too.
         """
+        suspected = self._suspect(D, residual, pushed_m, normal_E, usual)
+        if not held:
+            self._suspected = 0
+        elif suspected and not self._suspected:
+            self._suspected = HOLD
+        elif self._suspected:
+            self._suspected -= 1
+            return self._suspected == 0
+        return False
+
+    def _suspect(
+        self, D: FloatArray, residual: FloatArray, pushed_m: float, normal_E: FloatArray, usual: SlipLevels
+    ) -> bool:
+        c = self._limits
         self._D.append(D)
         self._residual.append(residual)
         if len(self._D) < BEFORE + AFTER:
             return False
         kick = float(kicks(np.stack(list(self._D)[BEFORE - _EARLIER - 2 :]), normal_E).max())
-        kicked = kick > max(self._kick_m, self._margin * usual.kick_m)
         rows = np.stack(self._residual)
         pattern = pattern_change(rows[:BEFORE], rows[BEFORE:])
-        slipped = kicked and pattern > max(self._pattern_m, self._margin * usual.pattern_m)
-        slipped |= pattern > max(self._alone_m, 4.0 * usual.pattern_m)
+        signs = (
+            min(kick / max(c.kick_m, c.margin * usual.kick_m), _MOST)
+            * min(pattern / max(c.pattern_m, c.margin * usual.pattern_m), _MOST)
+            * min(max(pushed_m / c.pushed_m, 0.5), 2.0)
+        )
+        kicked = kick > max(c.least_kick_m, c.margin * usual.kick_m)
+        slipped = kicked and signs > c.evidence
+        slipped |= pattern > max(c.pattern_alone_m, 4.0 * usual.pattern_m)
         if slipped:
             self._D.clear()  # the pattern after the slip is the new one
             self._residual.clear()
