@@ -23,7 +23,8 @@ sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 from live_bench import LEAD_S, PORTS, Trial, begin_with_the_trial, make_session, rss_mb  # noqa: E402
 from tests.live.servers import FPS, in_child, play_trial  # noqa: E402
 
-from tiptrace.live.session import LiveSession, LiveSummary  # noqa: E402
+from tiptrace.live.session import LiveSession  # noqa: E402
+from tiptrace.live.summary import LiveSummary  # noqa: E402
 from tiptrace.streams.recording import Recording  # noqa: E402
 from tiptrace.types import SIDES, Snapshot  # noqa: E402
 

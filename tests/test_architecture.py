@@ -19,7 +19,7 @@ MAY_IMPORT = {
     "sim": BASE | {"geometry"},
     "evaluation": BASE | {"geometry"},
     "streams": BASE | {"geometry", "sim", "drivers"},
-    "drivers": BASE | {"geometry"},
+    "drivers": BASE | {"compiled", "geometry"},
     "outputs": BASE | {"geometry", "evaluation"},
     "tracer": BASE | {"geometry", "perception", "estimation"},
     "pipeline": BASE | {"geometry", "streams", "tracer"},

@@ -15,8 +15,9 @@ import pytest
 from tests.live.servers import FPS, Fault, Feed, MjpegServer, feed_from
 from tests.streams.helpers import SIZE, make_rig, texture
 from tiptrace.drivers.base import DeviceStatus, Frame
+from tiptrace.drivers.jpeg_scan import warm_up
 from tiptrace.drivers.opening import camera_source, open_camera
-from tiptrace.drivers.picture import Framing, Novelty, PictureError, decode_jpeg, encode_jpeg
+from tiptrace.drivers.picture import Framing, Novelty, PictureError, decode_jpeg, encode_jpeg, inspect_jpeg
 from tiptrace.drivers.timeline import NS, ClockMap, Timeline
 from tiptrace.drivers.v4l2 import find_camera
 from tiptrace.errors import ConfigError, DeviceError
@@ -27,6 +28,7 @@ PICTURES = 60
 
 @pytest.fixture(scope="module")
 def feed() -> Feed:
+    warm_up()
     rng = np.random.default_rng(1)
     base = texture(1).astype(np.float64)
     samples: list[ImageSample | PoseSample] = []
@@ -119,7 +121,7 @@ def test_damage_in_a_jpeg_is_mostly_seen_by_its_bytes_and_a_cut_always() -> None
     rng = np.random.default_rng(0)
     for length in rng.integers(2, len(jpeg) - 1, 50):
         with pytest.raises(PictureError):
-            decode_jpeg(jpeg[:length])
+            inspect_jpeg(jpeg[:length])
 
 
 def test_a_torn_picture_is_held_back_and_a_lasting_change_is_not() -> None:

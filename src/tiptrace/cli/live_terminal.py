@@ -16,7 +16,8 @@ from rich.text import Text
 
 from tiptrace.calibration.gel_health import GelHealth
 from tiptrace.drivers.base import DeviceHealth, DeviceStatus
-from tiptrace.live.session import LiveSession, LiveSummary
+from tiptrace.live.session import LiveSession
+from tiptrace.live.summary import LiveSummary
 from tiptrace.types import Phase, Snapshot, Status
 
 _REFRESH_S = 0.2

@@ -37,12 +37,18 @@ class Frame:
         arrived_ns: When its last byte was here.
         image: (height, width, 3) BGR, cropped and resized as the rig says.
         jpeg: The very bytes that decode to ``image``, for a recorder; None if none was asked for.
+        after: Why frames between this one and the one before were left out (a :class:`DeviceStatus`); empty where
+            none were.
+        settled: Whether the camera's clock has been followed for long enough to trust ``stamp_ns`` to a millisecond or
+            two; False for a while after a connection or a clock that was set.
     """
 
     stamp_ns: int
     arrived_ns: int
     image: Image
     jpeg: bytes | None = None
+    after: str = ""
+    settled: bool = True
 
 
 @dataclass(frozen=True, slots=True)

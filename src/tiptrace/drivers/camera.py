@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
 
 from tiptrace.drivers.base import Closing, DeviceHealth, DeviceStatus, Frame, FrameTap, Wake
+from tiptrace.drivers.jpeg_scan import warm_up
 from tiptrace.drivers.meter import Meter
-from tiptrace.drivers.picture import Framing, Novelty, PictureError, decode_jpeg, encode_jpeg
+from tiptrace.drivers.picture import Framing, Novelty, PictureError, decode_jpeg, encode_jpeg, inspect_jpeg
 from tiptrace.drivers.timeline import NS, Timeline
 from tiptrace.errors import DeviceError
 from tiptrace.types import Image
@@ -33,12 +34,14 @@ class RawFrame:
         arrived_ns: When its last byte was here.
         jpeg: As sent; else ``image``.
         image: (height, width, 3) BGR.
+        settled: As in :class:`~tiptrace.drivers.base.Frame`.
     """
 
     stamp_ns: int
     arrived_ns: int
     jpeg: bytes | None = None
     image: Image | None = None
+    settled: bool = True
 
 
 class SourceLostError(DeviceError):
@@ -102,6 +105,7 @@ class ThreadedCamera(Closing):
         self._novelty = Novelty()
         self._repeats = 0
         self._last_ns = 0
+        self._after = ""
         self._wake: Wake = lambda: None
         self._frame_tap: FrameTap | None = None
         self._error: DeviceError | None = None
@@ -109,6 +113,7 @@ class ThreadedCamera(Closing):
 
     def start(self, wake: Wake, tap: FrameTap | None = None) -> None:
         """Connect and wait for the first frame."""
+        warm_up()  # the first image should not wait
         self._wake, self._frame_tap = wake, tap
         self._source.connect()
         self._thread = threading.Thread(target=self._run, name=f"camera {self.name}", daemon=True)
@@ -171,10 +176,15 @@ class ThreadedCamera(Closing):
             self._source.disconnect()
             self._wake()
 
+    def _bad(self, status: DeviceStatus, detail: str, count_as: str | None = None) -> None:
+        """Tell a fault; the next good frame remembers it."""
+        self._after = status.value
+        self._meter.bad(status, detail, count_as)
+
     def _reconnect(self, error: DeviceError) -> None:
         """Try again, less and less often, until it works or the session ends."""
         wait_s, most_s = _BACK_OFF_S
-        self._meter.bad(DeviceStatus.LOST, str(error))
+        self._bad(DeviceStatus.LOST, str(error))
         while not self._stop.is_set():
             self._source.disconnect()
             try:
@@ -190,11 +200,11 @@ class ThreadedCamera(Closing):
         if self._is_repeated(raw) or self._is_late(raw):
             return
         try:
-            frame = self._finish(raw)
+            frame = replace(self._finish(raw), after=self._after, settled=raw.settled)
         except PictureError as error:
-            self._meter.bad(DeviceStatus.GARBLED, f"{self.name}: an image {error}")
+            self._bad(DeviceStatus.GARBLED, f"{self.name}: an image {error}")
             return
-        self._last_ns = raw.stamp_ns
+        self._last_ns, self._after = raw.stamp_ns, ""
         if self._frame_tap is not None:
             self._frame_tap(frame)
         with self._lock:
@@ -216,7 +226,7 @@ class ThreadedCamera(Closing):
         frozen = self._repeats >= _FROZEN
         status = DeviceStatus.FROZEN if frozen else DeviceStatus.REPEATED
         what = "has stood still" if frozen else "sent the same image again"
-        self._meter.bad(status, f"{self.name}: {what} ({self._repeats} times)", "repeated")
+        self._bad(status, f"{self.name}: {what} ({self._repeats} times)", "repeated")
         return True
 
     def _is_late(self, raw: RawFrame) -> bool:
@@ -224,7 +234,7 @@ class ThreadedCamera(Closing):
         if age_ns <= _LATE_NS and raw.stamp_ns > self._last_ns:
             return False
         how = f"{age_ns / NS:.2f} s old" if age_ns > _LATE_NS else "out of order"
-        self._meter.bad(DeviceStatus.LATE, f"{self.name}: an image came {how}")
+        self._bad(DeviceStatus.LATE, f"{self.name}: an image came {how}")
         return True
 
     def _finish(self, raw: RawFrame) -> Frame:
@@ -234,15 +244,19 @@ class ThreadedCamera(Closing):
             PictureError: cut off or damaged.
             DeviceError: another size than the rig says.
         """
-        source = decode_jpeg(raw.jpeg) if raw.jpeg is not None else raw.image
+        facts, reduction, source = None, 1, raw.image
+        if raw.jpeg is not None:
+            facts = inspect_jpeg(raw.jpeg)
+            reduction = self._framing.reduction(facts.size_px)
+            source = decode_jpeg(raw.jpeg, reduction)
         assert source is not None
-        self._framing.check(self.name, source)
-        image = self._framing.apply(source)
-        if self._novelty.torn(image):
+        self._framing.check(self.name, source, reduction)
+        image = self._framing.apply(source, reduction)
+        if self._novelty.torn(image, facts):
             raise PictureError("is torn")
         if not self._encode:
             return Frame(raw.stamp_ns, raw.arrived_ns, image)
-        if raw.jpeg is not None and self._framing.unchanged(source):
+        if raw.jpeg is not None and reduction == 1 and self._framing.unchanged(source):
             return Frame(raw.stamp_ns, raw.arrived_ns, image, raw.jpeg)
         jpeg = encode_jpeg(image)
         return Frame(raw.stamp_ns, raw.arrived_ns, decode_jpeg(jpeg), jpeg)

@@ -87,7 +87,8 @@ class MjpegSource:
         except (OSError, http.client.HTTPException, ValueError, AttributeError) as error:
             raise SourceLostError(f"{self.name}: disconnected ({_why(error)})") from None
         arrived_ns = self._timeline.now_ns()
-        return RawFrame(self._stamp_ns(headers, first_ns), arrived_ns, jpeg=jpeg)
+        stamp_ns, settled = self._stamp(headers, first_ns)
+        return RawFrame(stamp_ns, arrived_ns, jpeg=jpeg, settled=settled)
 
     def abort(self) -> None:
         """Close the socket under a read."""
@@ -147,12 +148,13 @@ class MjpegSource:
             data += _line(response)
         raise ValueError("an image without end")
 
-    def _stamp_ns(self, headers: dict[bytes, bytes], first_ns: int) -> int:
+    def _stamp(self, headers: dict[bytes, bytes], first_ns: int) -> tuple[int, bool]:
+        """Capture on our timeline, and whether the server's clock is known well enough by now."""
         try:
             device_ns = round(float(headers[b"x-timestamp"]) * NS)
         except (KeyError, ValueError, OverflowError):
-            return first_ns
-        return self._clock.stamp_ns(device_ns, first_ns)
+            return first_ns, True
+        return self._clock.stamp_ns(device_ns, first_ns), self._clock.settled
 
 
 def _line(response: http.client.HTTPResponse) -> bytes:

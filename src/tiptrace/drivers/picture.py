@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tiptrace.config import Sensor
+from tiptrace.drivers.jpeg_scan import ScanError, ScanFacts, same_camera, walk
 from tiptrace.errors import DeviceError
 from tiptrace.types import Image
 
@@ -18,46 +19,51 @@ _FLIP = {"horizontal": 1, "vertical": 0, "both": -1}
 _BLOCKS = (16, 12)  # of which the picture's means are compared, x and y
 _BLOCK_STEP = 15.0  # grey levels by which a block's mean may change between two frames
 _MANY_BLOCKS = 3
+_SHARPER, _SHARPNESS = 2.0, 16.0  # times the picture before, and grey levels times 8 more
+_REDUCED = {
+    1: cv2.IMREAD_COLOR,
+    2: cv2.IMREAD_REDUCED_COLOR_2,
+    4: cv2.IMREAD_REDUCED_COLOR_4,
+    8: cv2.IMREAD_REDUCED_COLOR_8,
+}
 
 
 class PictureError(ValueError):
     """A picture that is cut off or damaged; the text says how."""
 
 
-def decode_jpeg(data: bytes) -> Image:
-    """A whole jpeg → (height, width, 3) BGR.
+def inspect_jpeg(data: bytes) -> ScanFacts:
+    """Make sure that a jpeg is whole; what it tells of itself.
 
-    OpenCV fills what is missing with grey and says nothing, so the frame of the file is checked first: it must begin
-    and end as a jpeg does, and its scan must hold no marker but restarts.
+    OpenCV fills what is missing with grey and says nothing, so the file is walked through first.
 
     Raises:
-        PictureError: cut off, or no jpeg.
+        PictureError: cut off, damaged, or no jpeg.
     """
     if data[:2] != b"\xff\xd8":
         raise PictureError("does not begin as a jpeg")
     end = data.rstrip(b"\x00")  # cameras pad
     if end[-2:] != b"\xff\xd9":
         raise PictureError("is cut off")
-    _check_scan(end)
     try:
-        image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_COLOR)
+        return walk(end)
+    except ScanError as error:
+        raise PictureError(str(error)) from None
+
+
+def decode_jpeg(data: bytes, reduction: int = 1) -> Image:
+    """A jpeg that is whole → (height / reduction, width / reduction, 3) BGR.
+
+    Raises:
+        PictureError: OpenCV cannot decode it.
+    """
+    try:
+        image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), _REDUCED[reduction])
     except cv2.error:
         image = None
     if image is None:
         raise PictureError("cannot be decoded")
     return np.asarray(image, dtype=np.uint8)
-
-
-def _check_scan(data: bytes) -> None:
-    """No marker but stuffing and restarts between the first scan's header and the end."""
-    start = data.find(b"\xff\xda")
-    if start < 0:
-        raise PictureError("has no picture in it")
-    scan = np.frombuffer(data, dtype=np.uint8)[start + 2 : -2]
-    after = scan[1:][scan[:-1] == 0xFF]
-    strange = (after != 0) & ((after < 0xD0) | (after > 0xD7)) & (after != 0xFF)
-    if np.any(strange) and b"\xff\xc2" not in data[:start]:  # progressive files have several scans
-        raise PictureError("holds bytes that no jpeg has")
 
 
 def encode_jpeg(image: Image) -> bytes:
@@ -84,13 +90,24 @@ class Framing:
         """Whether an image is already what the rig means."""
         return self._crop_px is None and self._flip is None and _size(image) == self.size_px
 
-    def check(self, name: str, image: Image) -> None:
+    def reduction(self, size_px: tuple[int, int] | None) -> int:
+        """By how much a decoder may shrink a jpeg of this size on its way: no more than the rig does anyway."""
+        if size_px is None:
+            return 1
+        crop = self._crop_px or (0, 0, *size_px)
+        for factor in (8, 4, 2):
+            whole = all(n % factor == 0 for n in (*size_px, *crop))
+            if whole and crop[2] // factor >= self.size_px[0] and crop[3] // factor >= self.size_px[1]:
+                return factor
+        return 1
+
+    def check(self, name: str, image: Image, reduction: int = 1) -> None:
         """The camera must send the size that was asked for, and the crop must lie in it.
 
         Raises:
             DeviceError: another size.
         """
-        W, H = _size(image)
+        W, H = (n * reduction for n in _size(image))
         if self.source_px is not None and self.source_px != (W, H):
             raise DeviceError(
                 f"{name}: sends {W}x{H} px, the rig file asks for {self.source_px[0]}x{self.source_px[1]}: set "
@@ -104,10 +121,10 @@ class Framing:
                     f"image of {W}x{H} px: correct the rig file"
                 )
 
-    def apply(self, image: Image) -> Image:
+    def apply(self, image: Image, reduction: int = 1) -> Image:
         """Crop, flip, resize: (h, w, 3) BGR in, (height, width, 3) as the rig means out."""
         if self._crop_px is not None:
-            left, top, width, height = self._crop_px
+            left, top, width, height = (n // reduction for n in self._crop_px)
             image = image[top : top + height, left : left + width]
         if self._flip is not None:
             image = np.asarray(cv2.flip(image, self._flip), dtype=np.uint8)
@@ -122,6 +139,7 @@ class Novelty:
     def __init__(self) -> None:
         self._print: int | None = None
         self._blocks: NDArray[Any] | None = None
+        self._facts: ScanFacts | None = None
 
     def repeated(self, data: bytes | memoryview) -> bool:
         """Whether these bytes or pixels are those of the picture before; a sensor's noise never repeats."""
@@ -130,15 +148,21 @@ class Novelty:
         self._print = mark
         return same
 
-    def torn(self, image: Image) -> bool:
-        """Whether parts of the picture jumped, as after a damaged byte, where a gel deforms gradually.
+    def torn(self, image: Image, facts: ScanFacts | None = None) -> bool:
+        """Whether the picture jumped, as after a damaged byte, where a gel deforms gradually.
 
-        A jump that stays is taken at its second frame: lamps may be switched.
+        Parts of it became brighter or darker, one block much sharper than any before, or the quantisation is another,
+        and not a scaled one. A jump that stays is taken at its second frame: lamps may be switched.
         """
         blocks = cv2.resize(image, _BLOCKS, interpolation=cv2.INTER_AREA).astype(np.float32)
         last, self._blocks = self._blocks, blocks
+        before, self._facts = self._facts, facts
         if last is None:
             return False
+        if facts is not None and before is not None:
+            sharper = facts.sharpest > _SHARPER * before.sharpest + _SHARPNESS
+            if sharper or not same_camera(before.quantisation, facts.quantisation):
+                return True
         return int((np.abs(blocks - last).max(axis=2) > _BLOCK_STEP).sum()) >= _MANY_BLOCKS
 
 

@@ -7,6 +7,7 @@ from collections import deque
 
 NS = 1_000_000_000
 _WINDOW_NS = 2 * NS  # of arrivals among which the least delay is looked for
+_SETTLED_NS = NS // 2  # of arrivals that tell the least delay well enough
 
 
 class Timeline:
@@ -43,14 +44,23 @@ class ClockMap:
     def __init__(self) -> None:
         self._offsets: deque[tuple[int, int]] = deque()  # arrival, offset: increasing, the first is the least
         self._last_ns: int | None = None
+        self._since_ns: int | None = None
         self.jumps = 0
+
+    @property
+    def settled(self) -> bool:
+        """Whether the search has gone on for long enough to trust the stamps."""
+        return bool(self._offsets) and self._offsets[-1][0] - (self._since_ns or 0) >= _SETTLED_NS
 
     def stamp_ns(self, device_ns: int, arrived_ns: int) -> int:
         """When a message was stamped by its device, on the session's timeline, ns; at most ``arrived_ns``."""
         offset = arrived_ns - device_ns
         if self._jumped(device_ns, offset):
             self._offsets.clear()
+            self._since_ns = arrived_ns
             self.jumps += 1
+        elif self._since_ns is None:
+            self._since_ns = arrived_ns
         self._last_ns = device_ns
         offsets = self._offsets
         while offsets and offsets[-1][1] >= offset:

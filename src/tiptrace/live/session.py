@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 
@@ -15,61 +13,30 @@ from tiptrace.drivers.base import DeviceHealth, DeviceStatus
 from tiptrace.errors import PerceptionError
 from tiptrace.live.monitor import StageOneMonitor, StageOneView
 from tiptrace.live.phases import PhaseMarker
-from tiptrace.live.recorder import Recorder, RecorderState
+from tiptrace.live.recorder import Recorder
+from tiptrace.live.source_watch import SourceWatch
+from tiptrace.live.summary import LiveSummary, Tally
+from tiptrace.live.views import Views
 from tiptrace.pipeline import Step, open_tracer, steps
 from tiptrace.streams.live import LiveStream
 from tiptrace.streams.sync_report import SyncReport
 from tiptrace.tracer import TipTracer
 from tiptrace.types import (
     SIDES,
-    Anchor,
     Event,
     FingerObservation,
-    FingerView,
-    FloatArray,
     ImageSample,
     Observation,
     Phase,
-    Side,
     Snapshot,
     Status,
     TipEstimate,
 )
 
-_RATE_WINDOW = 64
-_RATE_MEMORY_S = 3.0
-_LATENCIES = 20_000
 _LAST_EVENTS = 50
 _SILENT_S = 0.3  # without a pair; then a snapshot says so
 
 Subscriber = Callable[[Snapshot], None]
-
-
-@dataclass(frozen=True, slots=True)
-class LiveSummary:
-    """A session in numbers.
-
-    Attributes:
-        pairs: Estimated.
-        seconds: From the first to the last pair.
-        bad_pairs: Left out because an image could not be used.
-        latency_ms: (p50, p99, max) from the later image's arrival to the estimate; None without pairs.
-        anchor: Stage I result.
-        events: Of the whole session, in order.
-        sentences: What synchronisation dropped.
-        devices: State at the end.
-        recorder: State at the end, where there was one.
-    """
-
-    pairs: int
-    seconds: float
-    bad_pairs: int
-    latency_ms: tuple[float, float, float] | None
-    anchor: Anchor | None
-    events: tuple[Event, ...]
-    sentences: tuple[str, ...]
-    devices: dict[str, DeviceHealth]
-    recorder: RecorderState | None
 
 
 class LiveSession:
@@ -101,11 +68,9 @@ class LiveSession:
         if recorder is not None:
             stream.tap = recorder
         self._subscribers: list[Subscriber] = []
-        self._views = _Views(stream)
-        self._latencies: deque[float] = deque(maxlen=_LATENCIES)
+        self._views, self._tally = Views(), Tally()
+        self._watch = SourceWatch(None)
         self._bad: list[str] = []
-        self._bad_pairs = self._pairs = 0
-        self._first_ns = self._last_ns = 0
         self._shown = 0.0
         self._deadline: float | None = None
         self.on_open: Callable[[], None] | None = None
@@ -167,6 +132,7 @@ class LiveSession:
             if not self.stream.standby:
                 self.stream.begin()
             self.tracer, monitor = tracer, StageOneMonitor(tracer)
+            self._watch = SourceWatch(self.stream.period_s)
             if self.on_open is not None:
                 self.on_open()
             self._deadline = None if duration_s is None else time.monotonic() + duration_s
@@ -177,15 +143,11 @@ class LiveSession:
 
     def summary(self) -> LiveSummary:
         """The session so far."""
-        latency = None
-        if self._latencies:
-            p50, p99, most = np.percentile(np.asarray(self._latencies), [50, 99, 100])
-            latency = (float(p50), float(p99), float(most))
         return LiveSummary(
-            pairs=self._pairs,
-            seconds=(self._last_ns - self._first_ns) * 1e-9,
-            bad_pairs=self._bad_pairs,
-            latency_ms=latency,
+            pairs=self._tally.pairs,
+            seconds=self._tally.seconds,
+            bad_pairs=self._tally.bad_pairs,
+            latency_ms=self._tally.latency_ms,
             anchor=None if self.tracer is None else self.tracer.anchor,
             events=self._events(),
             sentences=tuple(self.report.sentences()),
@@ -200,26 +162,23 @@ class LiveSession:
 
     def _show(self, step: Step) -> None:
         done_ns = self.stream.timeline.now_ns()
-        arrivals = [
-            self.stream.arrived_ns(side, step.observation.finger(side).sample.stamp_ns) for side in SIDES
-        ]
-        known = [arrival for arrival in arrivals if arrival is not None]
+        arrivals = {
+            side: self.stream.arrival(side, step.observation.finger(side).sample.stamp_ns) for side in SIDES
+        }
+        known = [arrival.arrived_ns for arrival in arrivals.values() if arrival is not None]
         latency_ms = (done_ns - max(known)) * 1e-6 if known else None
-        if latency_ms is not None:
-            self._latencies.append(latency_ms)
-        self._pairs += 1
-        self._first_ns = self._first_ns or step.observation.stamp_ns
-        self._last_ns = step.observation.stamp_ns
+        self._tally.add(step.observation.stamp_ns, latency_ms)
+        health = self.stream.health()
+        marked = self._watch.mark(step.observation, step.estimate, arrivals, health["robot"])
         self._bad.clear()
         self._shown = time.monotonic()
         advice = "" if self.stage_one is None else self.stage_one.sentence
-        self._publish(
-            self._views.snapshot(step, latency_ms, self._events()[-_LAST_EVENTS:], advice, self._notes())
-        )
+        notes, events = self._notes(health), self._events()[-_LAST_EVENTS:]
+        self._publish(self._views.snapshot(replace(step, estimate=marked), latency_ms, events, advice, notes))
 
     def _bad_pair(self, observation: Observation, error: PerceptionError) -> None:
         """A pair whose images cannot be used: told, and no position claimed."""
-        self._bad_pairs += 1
+        self._tally.bad_pairs += 1
         self._bad = [str(error)]
         self._publish_nothing(observation.stamp_ns, observation.phase)
 
@@ -233,7 +192,9 @@ class LiveSession:
 
     def _publish_nothing(self, stamp_ns: int, phase: Phase | None) -> None:
         last = self.snapshot
-        notes = self._notes() or (("waiting for the first mark",) if self.stream.standby else ())
+        notes = self._notes(self.stream.health()) or (
+            ("waiting for the first mark",) if self.stream.standby else ()
+        )
         estimate = TipEstimate(stamp_ns, phase, Status.LOST)
         events = () if last is None else last.events
         self._publish(Snapshot(estimate, rate_hz=0.0, events=events, notes=notes))
@@ -248,11 +209,13 @@ class LiveSession:
 
     def _events(self) -> tuple[Event, ...]:
         told = [] if self.tracer is None else self.tracer.events
-        return tuple(sorted([*told, *self.report.gaps], key=lambda event: event.start_ns))
+        return tuple(
+            sorted([*told, *self.report.gaps, *self._watch.events], key=lambda event: event.start_ns)
+        )
 
-    def _notes(self) -> tuple[str, ...]:
+    def _notes(self, found: Mapping[str, DeviceHealth]) -> tuple[str, ...]:
         """What is wrong at this moment."""
-        devices = [health for health in self.stream.health().values() if health.status is not DeviceStatus.OK]
+        devices = [health for health in found.values() if health.status is not DeviceStatus.OK]
         notes = [
             *self._bad,
             *(health.detail or f"{health.name}: {health.status.value}" for health in devices),
@@ -282,48 +245,3 @@ def _rehearse(stream: LiveStream, method: str) -> None:
     with open_tracer(stream, method) as tracer:
         for _ in range(2):
             tracer.sensing(Observation(0, left, right))
-
-
-class _Views:
-    """Makes a snapshot of a turn of the loop."""
-
-    def __init__(self, stream: LiveStream) -> None:
-        self._stream = stream
-        self._start: dict[Side, FloatArray | None] = {}
-        self._times: deque[float] = deque(maxlen=_RATE_WINDOW)
-
-    def snapshot(
-        self,
-        step: Step,
-        latency_ms: float | None,
-        events: tuple[Event, ...],
-        advice: str,
-        notes: tuple[str, ...],
-    ) -> Snapshot:
-        """What a viewer is shown of it."""
-        fingers: dict[str, Any] = {side: self._finger(step, side) for side in SIDES}
-        return Snapshot(
-            estimate=step.estimate,
-            T_B_E=step.observation.left.T_B_E,
-            rate_hz=self._rate_hz(),
-            latency_ms=latency_ms,
-            events=events,
-            advice=advice,
-            notes=notes,
-            **fingers,
-        )
-
-    def _finger(self, step: Step, side: Side) -> FingerView:
-        sample, uv_px = step.observation.finger(side).sample, step.sensed.finger(side).markers.uv_px
-        start = self._start.setdefault(side, uv_px)
-        image = sample.image if isinstance(sample, ImageSample) else None
-        return FingerView(image, uv_px, start)
-
-    def _rate_hz(self) -> float | None:
-        now = time.monotonic()
-        self._times.append(now)
-        while now - self._times[0] > _RATE_MEMORY_S:
-            self._times.popleft()
-        if len(self._times) < 2:
-            return None
-        return (len(self._times) - 1) / (self._times[-1] - self._times[0])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,7 +15,9 @@ from numpy.typing import NDArray
 from tiptrace.config import Camera as CameraSettings
 from tiptrace.config import Rig, Sensor, dump_yaml
 from tiptrace.drivers.base import Camera
-from tiptrace.drivers.opening import open_camera
+from tiptrace.drivers.camera import RawFrame
+from tiptrace.drivers.opening import camera_source, open_camera
+from tiptrace.drivers.picture import PictureError, decode_jpeg, inspect_jpeg
 from tiptrace.drivers.timeline import Timeline
 from tiptrace.drivers.v4l2 import describe, list_cameras
 from tiptrace.errors import DeviceError, OutputError, PerceptionError
@@ -27,6 +30,7 @@ _BORDER = 1.0 / 7.0  # of a GelSight Mini's image, on each side, that shows the 
 _LOOK_PX = (64, 48)
 _TOUCH_LEVELS = 6.0  # mean change over the busiest tenth of the picture that is a touch
 _TIMES_OTHER = 2.0  # and so much more than at the other camera
+_TRIED_FRAMES = 25
 _REFERENCE_FRAMES = 20
 _STILL_LEVELS = 4.0  # spread of a pixel while nothing touches, median over the picture
 
@@ -133,18 +137,15 @@ class Setup:
         return old.model_copy(update={"camera": camera})
 
     def _source_size(self, address: str) -> tuple[int, int]:
-        from tiptrace.drivers.opening import camera_source
-        from tiptrace.drivers.picture import decode_jpeg
-
         source = camera_source(address, self._rig.sensors.left, self._timeline)
         source.connect()
         try:
-            raw = source.read()
-            image = decode_jpeg(raw.jpeg) if raw.jpeg is not None else raw.image
-            assert image is not None
-            return image.shape[1], image.shape[0]
+            for _ in range(_TRIED_FRAMES):  # the first ones of a camera may be damaged
+                with suppress(PictureError):
+                    return _size_px(source.read())
         finally:
             source.disconnect()
+        raise DeviceError(f"{address}: sends damaged images only: check the cable")
 
     def reference(self, side: Side, sensor: Sensor, address: str) -> Image:
         """Mean of some frames of the untouched gel.
@@ -186,6 +187,20 @@ class Setup:
         except OSError as error:
             raise OutputError(f"{path}: cannot be written ({error.strerror})") from None
         return path
+
+
+def _size_px(raw: RawFrame) -> tuple[int, int]:
+    """Width and height of what a camera sends.
+
+    Raises:
+        PictureError: damaged.
+    """
+    image = raw.image
+    if raw.jpeg is not None:
+        inspect_jpeg(raw.jpeg)
+        image = decode_jpeg(raw.jpeg)
+    assert image is not None
+    return image.shape[1], image.shape[0]
 
 
 def make_reference(side: Side, frames: list[Image]) -> Image:

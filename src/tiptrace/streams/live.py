@@ -7,7 +7,7 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from operator import itemgetter
 from types import TracebackType
@@ -25,6 +25,21 @@ _WARM_UP_S, _WARM_UP_FRAMES = 2.0, 8
 _SPACING_SHARE = 0.85  # of the measured period between frames: closer ones do not come
 _ARRIVALS = 256
 _ENDED_GRACE_S = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Arrival:
+    """How an image came.
+
+    Attributes:
+        arrived_ns: When its last byte was here.
+        after: As in :class:`~tiptrace.drivers.base.Frame`.
+        settled: Likewise.
+    """
+
+    arrived_ns: int
+    after: str
+    settled: bool
 
 
 class Tap(Protocol):
@@ -50,6 +65,7 @@ class LiveStream:
 
     Attributes:
         settings: Limits of synchronisation that suit these cameras; final after entering.
+        period_s: Measured time between a camera's frames, the longer of both, after entering; None if it is not known.
         first_images: An image of each finger, after entering.
         tap: Sees every sample as it arrives, as a recorder does, from :meth:`begin` on.
         on_idle: Called several times a second from the loop.
@@ -72,6 +88,7 @@ class LiveStream:
         self.references: dict[Side, Image] = dict(references or {})
         self.gel_models: dict[str, bytes] = dict(gel_models or {})
         self.settings: SyncSettings = LIVE
+        self.period_s: float | None = None
         self.first_images: dict[Side, Image] = {}
         self.standby = standby
         self.tap: Tap | None = None
@@ -82,7 +99,7 @@ class LiveStream:
         self._lock = threading.Lock()
         self._marks: list[PhaseSample] = []
         self._begin_ns: int | None = None
-        self._arrived: OrderedDict[tuple[Side, int], int] = OrderedDict()
+        self._arrived: OrderedDict[tuple[Side, int], Arrival] = OrderedDict()
         self._devices = ExitStack()
 
     # --- opening and closing -------------------------------------------------------------------------------
@@ -125,6 +142,7 @@ class LiveStream:
         rates = [self._cameras[side].health().rate_hz for side in SIDES]
         known = [rate for rate in rates if rate is not None]
         if len(known) == 2:
+            self.period_s = 1.0 / min(known)
             self.settings = replace(LIVE, min_frame_spacing_s=_SPACING_SHARE / max(known))
 
     def begin(self) -> None:
@@ -153,8 +171,8 @@ class LiveStream:
         found = {str(side): camera.health() for side, camera in self._cameras.items()}
         return {**found, "robot": self._robot.health()}
 
-    def arrived_ns(self, side: Side, stamp_ns: int) -> int | None:
-        """When the last byte of an image was here; known for the last few seconds."""
+    def arrival(self, side: Side, stamp_ns: int) -> Arrival | None:
+        """How an image came; known for the last few seconds."""
         return self._arrived.get((side, stamp_ns))
 
     # --- the stream ----------------------------------------------------------------------------------------
@@ -191,7 +209,7 @@ class LiveStream:
         found: list[tuple[int, Sample]] = []
         for side in SIDES:
             for frame in self._cameras[side].take():
-                self._arrived[side, frame.stamp_ns] = frame.arrived_ns
+                self._arrived[side, frame.stamp_ns] = Arrival(frame.arrived_ns, frame.after, frame.settled)
                 found.append((frame.arrived_ns, ImageSample(side, frame.stamp_ns, frame.image)))
         for sample in self._robot.take():
             if isinstance(sample, PhaseSample):
