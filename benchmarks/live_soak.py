@@ -3,21 +3,25 @@
     python benchmarks/live_soak.py trial.mcap --faults 200
 
 Camera stall, disconnect, frozen, repeated, dropped, cut off and garbage images, a camera clock that is set; robot
-drop-out, silence and clock; a slow disk. A fault every three seconds. The servers play the trial forwards and
-backwards, so the true tip is known at every instant.
+drop-out, silence and clock; the machine's wall clock set by up to an hour and back; a slow disk. A fault every 3.5 s.
+The servers play the trial forwards and backwards, so the true tip is known at every instant. Exit code 1 where a limit
+is not kept.
 """
 
 from __future__ import annotations
 
 import argparse
+import faulthandler
 import os
 import sys
 import tempfile
+import threading
 import time
 from collections import Counter
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
@@ -27,10 +31,13 @@ from tests.live.servers import Fault, in_child, play_trial  # noqa: E402
 
 from tiptrace.live.session import LiveSession  # noqa: E402
 from tiptrace.streams.recording import Recording  # noqa: E402
-from tiptrace.types import SIDES, ImageSample, Phase, Snapshot, Status  # noqa: E402
+from tiptrace.types import SIDES, BoolArray, FloatArray, ImageSample, Phase, Snapshot, Status  # noqa: E402
 
 CAMERA_FAULTS = ("stall", "disconnect", "freeze", "repeat", "drop", "truncate", "garbage", "clock")
 ROBOT_FAULTS = ("disconnect", "stall", "clock")
+HANG_S = 10.0
+RECOVERY_S = 2.0
+PAUSE_S = 0.11  # between two pairs: more than two periods
 SILENT_ERROR_M = 0.003  # beyond the same session's median without faults
 
 
@@ -38,7 +45,7 @@ def draw(count: int, begin_s: float, seed: int) -> tuple[Fault, ...]:
     """Faults of 0.2 to 1.5 s, one every 3.5 s."""
     rng = np.random.default_rng(seed)
     kinds = [(kind, side) for kind in CAMERA_FAULTS for side in SIDES]
-    kinds += [(kind, "robot") for kind in ROBOT_FAULTS] * 3 + [("slow", "disk")] * 2
+    kinds += [(kind, "robot") for kind in ROBOT_FAULTS] * 3 + [("slow", "disk"), ("clock", "wall")] * 2
     faults = []
     for k in range(count):
         kind, target = kinds[int(rng.integers(len(kinds)))]
@@ -59,6 +66,39 @@ class Disk:
             if fault.start_s <= now < fault.end_s:
                 time.sleep(fault.end_s - now)
         self._fsync(number)
+
+
+class WallClock:
+    """``time.time`` and ``time.time_ns`` of this process, set by up to an hour while a fault says so."""
+
+    def __init__(self, faults: tuple[Fault, ...], start: float) -> None:
+        self._faults, self._start = [f for f in faults if f.target == "wall"], start
+        self._time_ns = time.time_ns
+
+    def install(self) -> None:
+        """Every module calls them through ``time``."""
+        time.time_ns = self.time_ns
+        time.time = lambda: self.time_ns() * 1e-9
+
+    def time_ns(self) -> int:
+        now = time.monotonic() - self._start
+        for k, fault in enumerate(self._faults):
+            if fault.start_s <= now < fault.end_s:
+                return self._time_ns() + (-1) ** k * round(3600e9 / (1 + k % 7) ** 3)
+        return self._time_ns()
+
+
+def watch_for_hangs(watch: Watch) -> None:
+    """End the process where nothing was said for ten seconds."""
+
+    def look() -> None:
+        while time.monotonic() - watch.last < HANG_S:
+            time.sleep(0.5)
+        print(f"  HANG: nothing was said for {HANG_S:g} s", flush=True)
+        faulthandler.dump_traceback()
+        os._exit(3)
+
+    threading.Thread(target=look, daemon=True).start()
 
 
 class Watch:
@@ -109,24 +149,36 @@ def main() -> None:
         os.fsync = Disk(faults, start)
         out = Path(folder) / "soak.mcap"
         session = make_session(trial, out)
+        WallClock(faults, start).install()
         watch = Watch(session, trial, start, faults[-1].end_s + 4.0)
         session.subscribe(watch)
         begin_with_the_trial(session, trial, start)
         memory = rss_mb()
+        watch_for_hangs(watch)
         summary = session.run()
-        print(f"{len(faults)} faults in {summary.seconds:.0f} s, {summary.pairs} pairs")
-        judge(watch, faults)
-        print(f"  memory before / after          {memory:.0f} / {rss_mb():.0f} MB")
-        print(f"  events                         {dict(Counter(e.kind for e in summary.events))}")
+        watch.last = float("inf")
+        print(
+            f"{len(faults)} faults (seed {arguments.seed}) in {summary.seconds:.0f} s, {summary.pairs} pairs"
+        )
+        drawn = Counter(f"{fault.kind} of {fault.target}" for fault in faults)
+        say("faults", ", ".join(f"{name} {count}" for name, count in sorted(drawn.items())))
+        say("crashes, hangs", f"none, none (longest time without a word {watch.longest_silence_s:.2f} s)")
+        kept = [judge(watch, faults), check(out)]
+        say("memory before / after", f"{memory:.0f} / {rss_mb():.0f} MB")
+        say("events", str(dict(Counter(e.kind for e in summary.events))))
         states = {name: health.status.value for name, health in summary.devices.items()}
-        print(f"  at the end                     {states} {watch.notes}")
-        print(f"  longest time without a word    {watch.longest_silence_s:.2f} s")
-        print(f"  device faults                  { {n: dict(h.faults) for n, h in summary.devices.items()} }")
-        print(f"  recorder                       {summary.recorder}")
-        check(out)
+        say("at the end", f"{states} {watch.notes}")
+        say("device faults", str({n: dict(h.faults) for n, h in summary.devices.items()}))
+        say("recorder", str(summary.recorder))
+    sys.exit(not all(kept))
 
 
-def judge(watch: Watch, faults: tuple[Fault, ...]) -> None:
+def say(name: str, value: str) -> None:
+    print(f"  {name:34s} {value}")
+
+
+def judge(watch: Watch, faults: tuple[Fault, ...]) -> bool:
+    """Whether nothing was silently wrong, every pair after a pause was marked, and all came back in time."""
     t = np.array([row[0] for row in watch.rows])
     status = np.array([row[1].value for row in watch.rows])
     error = np.array([row[3] for row in watch.rows])
@@ -135,40 +187,70 @@ def judge(watch: Watch, faults: tuple[Fault, ...]) -> None:
     for fault in faults:
         touched |= (t >= fault.start_s - 0.1) & (t <= fault.end_s + 2.0)
     calm = late & ~touched & np.isfinite(error)
-    usual = float(np.median(error[calm])) if calm.any() else float("nan")
+    usual = float(np.median(error[calm])) if calm.any() else 0.0
+    if calm.any():
+        say("error without faults", f"{spread(error[calm])} ({calm.sum()} pairs)")
+    for name in ("ok", "degraded"):
+        about = late & touched & np.isfinite(error) & (status == name)
+        if about.any():
+            say(f"error of '{name}' about faults", f"{spread(error[about])} ({about.sum()} pairs)")
     claimed = late & touched & np.isfinite(error) & (status == "ok")
     wrong = claimed & (error > usual + SILENT_ERROR_M)
-    print(
-        f"  error without faults           median {np.median(error[calm]) * 1e3:.2f}, p99 {usual * 1e3:.2f} mm"
-    )
-    if claimed.any():
-        middle, most = np.median(error[claimed]) * 1e3, error[claimed].max() * 1e3
-        print(f"  error of 'ok' about faults     median {middle:.2f}, max {most:.2f} mm")
-    print(f"  'ok' and 3 mm off about faults  {int(wrong.sum())} of {int(claimed.sum())}")
+    say("silently wrong ('ok', 3 mm off)", f"{int(wrong.sum())} of {int(claimed.sum())}")
+    tell_wrong(t, error, wrong, faults)
+    unmarked = after_a_pause(t, np.isfinite(error)) & (status == "ok") & late
+    say("'ok' right after a pause", f"{int(unmarked.sum())}")
+    tell_wrong(t, error, unmarked, faults)
+    say("status about faults", str(dict(Counter(status[touched].tolist()))))
+    slow = tell_recovery(t, status, faults)
+    return not (wrong.any() or unmarked.any() or slow)
+
+
+def spread(error: FloatArray) -> str:
+    median, p99, most = np.percentile(error * 1e3, [50, 99, 100])
+    return f"median {median:.2f}, p99 {p99:.2f}, max {most:.2f} mm"
+
+
+def after_a_pause(t: FloatArray, known: BoolArray) -> BoolArray:
+    """Pairs with a position whose predecessor with one is more than two periods older."""
+    found, last = np.zeros(len(t), dtype=bool), t[0]
+    for k in np.flatnonzero(known):
+        found[k] = t[k] - last > PAUSE_S
+        last = t[k]
+    return found
+
+
+def tell_wrong(t: FloatArray, error: FloatArray, wrong: BoolArray, faults: tuple[Fault, ...]) -> None:
     for k in np.flatnonzero(wrong)[:5]:
         near = min(faults, key=lambda f: abs(f.end_s - t[k]))
-        before = t[max(k - 3, 0) : k] - t[k]
+        before = t[:k][np.isfinite(error[:k])][-3:] - t[k]
         print(
             f"      {error[k] * 1e3:.1f} mm, {t[k] - near.end_s:+.2f} s from the end of {near.kind} of {near.target} "
             f"({near.end_s - near.start_s:.1f} s long), pairs before it at {np.round(before, 2)} s"
         )
-    print(f"  status about faults            {dict(Counter(status[touched].tolist()))}")
-    recoveries = {}
-    for fault in faults:
-        after = t[(t > fault.end_s) & (status != "lost")]
-        recoveries[fault] = float(after.min() - fault.end_s) if len(after) else float("inf")
-    worst = sorted(recoveries.items(), key=lambda item: -item[1])[:3]
-    slow = sum(value > 2.0 for value in recoveries.values())
-    print(
-        f"  recovery                       median {np.median(list(recoveries.values())):.2f} s, over 2 s: {slow}"
-    )
-    for fault, value in worst:
-        print(
-            f"      {value:.2f} s after {fault.kind} of {fault.target}, {fault.end_s - fault.start_s:.1f} s long"
+
+
+def tell_recovery(t: FloatArray, status: NDArray[np.str_], faults: tuple[Fault, ...]) -> bool:
+    """Time from a fault's end to the next position, and to the next `ok`; whether one took too long."""
+    slow = 0
+    for name, usable in (("position", ("ok", "degraded")), ("'ok'", ("ok",))):
+        times = {}
+        for fault in faults:
+            after = t[(t > fault.end_s) & np.isin(status, usable)]
+            times[fault] = float(after.min() - fault.end_s) if len(after) else float("inf")
+        (fault, worst), values = max(times.items(), key=lambda item: item[1]), list(times.values())
+        over = sum(value > RECOVERY_S for value in values)
+        slow += over if name == "position" else 0
+        say(
+            f"recovery to {name}",
+            f"median {np.median(values):.2f} s, worst {worst:.2f} s ({fault.kind} of {fault.target}, "
+            f"{fault.end_s - fault.start_s:.1f} s long), over {RECOVERY_S:g} s: {over}",
         )
+    return slow > 0
 
 
-def check(out: Path) -> None:
+def check(out: Path) -> bool:
+    """Whether the recording is there, readable to its end, with all stamps in order."""
     recording = Recording(out)
     images, ordered = 0, True
     for survey in recording.survey.values():
@@ -176,9 +258,11 @@ def check(out: Path) -> None:
             ordered &= bool(np.all(np.diff(survey.header_ns) > 0))
     for sample in recording:
         images += isinstance(sample, ImageSample)
-    print(
-        f"  recording                      {images} images, stamps in order: {ordered}, notes: {recording.notes}"
+    say(
+        "recording",
+        f"{images} images, read to the end, stamps in order: {ordered}, notes: {recording.notes or 'none'}",
     )
+    return ordered and not recording.notes
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ from tiptrace.drivers.base import DeviceStatus, PoseFrames
 from tiptrace.drivers.opening import open_robot
 from tiptrace.drivers.sample_queue import SampleQueue
 from tiptrace.drivers.timeline import NS, Timeline
+from tiptrace.drivers.ur import pose_matrix
 from tiptrace.errors import ConfigError, DeviceError
 from tiptrace.geometry.transforms import rotation_exp, transform
 from tiptrace.types import FloatArray, OpeningSample, PoseSample
@@ -33,6 +34,18 @@ def make_feed() -> Feed:
 def port_is_free() -> bool:
     with socket.socket() as probe:
         return probe.connect_ex(("127.0.0.1", 30004)) != 0
+
+
+def test_a_pose_in_plain_numbers_is_that_of_the_exponential_map() -> None:
+    rng = np.random.default_rng(0)
+    for scale in (0.0, 1e-9, 1e-7, 1e-5, 0.1, 1.0, np.pi):
+        for w in rng.normal(size=(20, 3)):
+            x = np.concatenate([rng.normal(size=3), scale * w / np.linalg.norm(w)])
+            T = pose_matrix(x.tolist())
+            assert T is not None
+            assert np.abs(T - transform(rotation_exp(x[3:]), x[:3])).max() < 1e-12
+    assert pose_matrix([0.0] * 5) is None
+    assert pose_matrix([0.0] * 5 + [float("nan")]) is None
 
 
 @pytest.fixture

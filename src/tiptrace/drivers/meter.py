@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 from collections import Counter, deque
-from itertools import pairwise
 
 import numpy as np
 
@@ -12,6 +11,7 @@ from tiptrace.drivers.base import DeviceHealth, DeviceStatus
 from tiptrace.drivers.timeline import NS, Timeline
 
 _WINDOW = 256
+_RATE_EVERY_NS = NS // 4  # rate and jitter are worked out anew
 
 
 class Meter:
@@ -32,6 +32,8 @@ class Meter:
         self._count = 0
         self._faults: Counter[str] = Counter()
         self._status, self._detail = DeviceStatus.STARTING, ""
+        self._rate: tuple[float | None, float | None] = (None, None)
+        self._rate_ns = 0
 
     def good(self, stamp_ns: int, arrived_ns: int) -> None:
         """A new sample was delivered."""
@@ -60,16 +62,26 @@ class Meter:
             return self._faults[kind]
 
     def health(self) -> DeviceHealth:
-        """State at this moment."""
+        """State at this moment; rate and jitter are those of the last quarter of a second."""
+        now_ns = self._timeline.now_ns()
         with self._lock:
-            stamps, count, faults = list(self._stamps), self._count, tuple(sorted(self._faults.items()))
+            stamps: list[int] | None = None
+            if now_ns - self._rate_ns > _RATE_EVERY_NS or None in self._rate:
+                stamps, self._rate_ns = list(self._stamps), now_ns
+            count, faults = self._count, tuple(sorted(self._faults.items()))
             status, detail, last = self._status, self._detail, self._last_arrival
-        age_s = None if last is None else (self._timeline.now_ns() - last) / NS
+        if stamps is not None:
+            self._rate = _rate(stamps)
+        rate_hz, jitter_ms = self._rate
+        age_s = None if last is None else (now_ns - last) / NS
         if status is DeviceStatus.OK and age_s is not None and age_s > self._stale_s:
             status, detail = DeviceStatus.STALE, f"{self.name}: nothing new for {age_s:.1f} s"
-        rate_hz = jitter_ms = None
-        if len(stamps) > 2:
-            steps_s = np.array([b - a for a, b in pairwise(stamps)]) / NS
-            rate_hz = float(1.0 / max(float(steps_s.mean()), 1e-9))
-            jitter_ms = float(steps_s.std() * 1e3)
         return DeviceHealth(self.name, status, detail, count, rate_hz, jitter_ms, age_s, faults)
+
+
+def _rate(stamps: list[int]) -> tuple[float | None, float | None]:
+    """Hz, and the standard deviation of the time between samples, ms; None before there are three."""
+    if len(stamps) <= 2:
+        return None, None
+    steps_s = np.diff(np.array(stamps, dtype=np.int64)) / NS
+    return float(1.0 / max(float(steps_s.mean()), 1e-9)), float(steps_s.std() * 1e3)

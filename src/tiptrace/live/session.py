@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import gc
 import time
-from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 
 import numpy as np
@@ -129,6 +130,7 @@ class LiveSession:
             if self.recorder is not None:
                 stack.enter_context(self.recorder)
             tracer = stack.enter_context(open_tracer(self.stream, self.method))
+            stack.enter_context(_no_sweeps())
             if not self.stream.standby:
                 self.stream.begin()
             self.tracer, monitor = tracer, StageOneMonitor(tracer)
@@ -229,6 +231,17 @@ class LiveSession:
                     f"the disk does not keep up: {state.dropped} samples are missing in the recording"
                 )
         return tuple(notes)
+
+
+@contextmanager
+def _no_sweeps() -> Iterator[None]:
+    """Everything that is there already is never looked at by the garbage collector: a sweep takes many frames' time."""
+    gc.collect()
+    gc.freeze()
+    try:
+        yield
+    finally:
+        gc.unfreeze()
 
 
 def _rehearse(stream: LiveStream, method: str) -> None:

@@ -21,6 +21,7 @@ from tiptrace.streams.synchronise import LIVE, SyncSettings
 from tiptrace.types import SIDES, Image, ImageSample, OpeningSample, Phase, PhaseSample, Sample, Side
 
 _IDLE_S = 0.2
+_LOOK_S = 0.05  # between two looks at the devices' states
 _WARM_UP_S, _WARM_UP_FRAMES = 2.0, 8
 _SPACING_SHARE = 0.85  # of the measured period between frames: closer ones do not come
 _ARRIVALS = 256
@@ -187,6 +188,7 @@ class LiveStream:
         if self._begin_ns is None:
             self.begin()
         ended_at: float | None = None
+        looked_at = 0.0
         while True:
             stopping = self._stop.is_set()
             if not stopping:
@@ -197,11 +199,15 @@ class LiveStream:
                     yield sample
             if stopping:
                 return
+            now = time.monotonic()
+            if now - looked_at < _LOOK_S:
+                continue
+            looked_at = now
             if self.on_idle is not None:
                 self.on_idle()
             if self._ended():
-                ended_at = ended_at or time.monotonic()
-                if time.monotonic() - ended_at > _ENDED_GRACE_S:
+                ended_at = ended_at or now
+                if now - ended_at > _ENDED_GRACE_S:
                     return
 
     def _gather(self) -> list[Sample]:
