@@ -30,6 +30,9 @@ from tiptrace.types import Anchor, Event, FloatArray, Phase, PoseSample, SensedP
 
 _TEMPLATE_FRAMES = 5
 _TOO_FEW = "fewer markers than a rigid motion needs, or none on one pad"
+_SLIPPED_EARLY = (
+    "the tool slipped in the grasp while its tip rested: Stage I was solved in parts, before and after"
+)
 
 
 class FullConfig(BaseModel):
@@ -213,6 +216,8 @@ class FullEstimator:
         """Take the anchor, or refuse it and say which motion is missing."""
         self._anchoring = anchoring
         tip_map, limit = anchoring.tip_map, self._config.refuse_sigma_m
+        for before, after in anchoring.slips_ns:
+            self._log.note("grasp-slip", self._exposure_ns(before), self._exposure_ns(after), _SLIPPED_EARLY)
         covariance = tip_map.covariance[P, P]
         weak = weak_axes(covariance, limit)
         if weak:
@@ -244,12 +249,7 @@ class FullEstimator:
             self._log.note("pose-gap", stamp_ns, stamp_ns, "no end-effector poses about this instant")
             return estimate
         if not self._usable(motions):
-            self._log.note(
-                "too-few-markers",
-                stamp_ns,
-                stamp_ns,
-                "fewer markers than a rigid motion needs, or none on one pad",
-            )
+            self._log.note("too-few-markers", stamp_ns, stamp_ns, _TOO_FEW)
             return estimate
         tip = self._propagate(pair.stamp_ns, motions, hand)
         status, extra = self._verdict.of(stamp_ns, self._judge(markers, motions, hand, repeated))

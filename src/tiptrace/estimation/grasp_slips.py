@@ -30,8 +30,8 @@ class GraspSlipConfig(BaseModel):
         default=0.6, gt=0, le=1
     )  # the first slip brings the inflation down by at least this
     most: int = Field(
-        default=0, ge=0
-    )  # slips sought in Stage I; 0: none, such a Stage I keeps its large covariance
+        default=3, ge=0
+    )  # slips sought in Stage I; 0: such a Stage I keeps its large covariance
     least_frames: int = Field(default=10, ge=5)  # between slips
 
 

@@ -26,7 +26,7 @@ class Tip:
         shown_E: (3,) D_t, the displacement in the grasp that the markers show, m.
         moved_E: (3,) G⁻¹ D_t, what the tool really did, m.
         jacobian: (3, 19) of p_B with respect to the unknowns of the tip map.
-        own: (3, 3) m², the part of the covariance that is this frame's alone.
+        own: (3, 3) m², the part of the covariance that is this frame's alone, as noisy as Stage I was.
     """
 
     p_B: FloatArray
@@ -48,7 +48,7 @@ def propagate(
         k: Frame.
         hand: One hand state.
         phase: t/T_I − 1, for the drift.
-        noise_m: Standard deviation of the hand pose at the tip, and of what the model leaves out.
+        noise_m: Assumed standard deviation of the hand pose at the tip, and of what the model leaves out.
     """
     R, t = motions.R[k], motions.t[k]
     R_BE, t_BE = hand.T_B_E[0, :3, :3], hand.T_B_E[0, :3, 3]
@@ -67,5 +67,5 @@ def propagate(
     # The estimate is stamped s − τ and the hand read there: a wrong τ only misplaces the in-grasp part, which the
     # caller adds from its rate.
     LB = np.concatenate([-L @ skew(shown_at - motions.centre[k]), L], axis=1)  # (3, 6) ∂p_B/∂(ω, v)
-    own = LB @ motions.covariance[k] @ LB.T + noise_m**2 * np.eye(3)
+    own = tip_map.noise * (LB @ motions.covariance[k] @ LB.T + noise_m**2 * np.eye(3))
     return Tip(p_B, J @ tip_map.covariance @ J.T + own, D, moved, J, own)

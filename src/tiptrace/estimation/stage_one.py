@@ -46,7 +46,7 @@ class Anchoring:
     hand: HandStates | None
     reference: Reference
     start_ns: int
-    slips_ns: tuple[int, ...] = ()
+    slips_ns: tuple[tuple[int, int], ...] = ()  # last frame before and first after each slip in it
 
     @property
     def tool_rotations(self) -> FloatArray:
@@ -174,7 +174,7 @@ class StageOne:
         parts, tip_map = self._through_slips(Parts([fit], [only(motions, good)], [], X), solution)
         ref = parts.reference(tip_map.c, self._normal)
         hand = hand_at(tip_map.latency_s)
-        slips = tuple(int(kept[k]) for k in parts.cuts)
+        slips = tuple((int(kept[k - 1]), int(kept[k])) for k in parts.cuts)
         return Anchoring(tip_map, parts.last, weights, kept, parts.motions, hand, ref, int(stamps[0]), slips)
 
     def _through_slips(self, parts: Parts, solution: Callable[[Parts], TipMap]) -> tuple[Parts, TipMap]:
@@ -214,8 +214,9 @@ class StageOne:
         return self._frames[-1][1].axes[0, :, 2]
 
     def fresh(self) -> StageOne:
-        """An empty segment with the same settings."""
-        return StageOne(self._config, self._patch, self._motion, self._tip_map, self._half_s)
+        """An empty segment with the same settings in which no slips are sought: in mid-trial they are watched for."""
+        still = self._config.model_copy(update={"slips": self._config.slips.model_copy(update={"most": 0})})
+        return StageOne(still, self._patch, self._motion, self._tip_map, self._half_s)
 
     def keep_from(self, stamp_ns: int) -> None:
         """Forget frames and poses before an instant."""

@@ -49,6 +49,7 @@ class TipMap:
         residual: (T, 3) of ``D_t(c_t) − G u_t`` in F_E, m.
         checks: What Stage I says of itself; None without one.
         rested: Share of frames in which the tip rested, as far as the solution can tell.
+        noise: Variance of Stage I's frames over the assumed, which those of Stage II share.
     """
 
     theta: FloatArray
@@ -61,6 +62,7 @@ class TipMap:
     residual: FloatArray
     checks: AnchorChecks | None = None
     rested: float = 1.0
+    noise: float = 1.0
 
     @property
     def c(self) -> FloatArray:
@@ -160,6 +162,7 @@ def solve_tip_map(
         best.r,
         solver.checks(best),
         float(np.mean(best.weights > 0.1)),
+        best.noise,
     )
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from tiptrace.estimation.anchor import TipPrior, fixed_point_ml
-from tiptrace.estimation.information import inflation, scaled_inverse
+from tiptrace.estimation.information import residual_noise, scaled_inverse
 from tiptrace.estimation.motion import Motions
 from tiptrace.estimation.pose_track import HandStates
 from tiptrace.estimation.robust import scale_from_median, tukey_weight
@@ -51,7 +51,10 @@ class TipMapConfig(BaseModel):
     slip_again: float = Field(default=0.5, ge=0)  # of the slips in Stage I, per its length, in Stage II
     drift_evidence: float = Field(default=3.0, gt=0)  # sigmas
     pose_sigma_m: float = Field(default=4e-5, gt=0)  # of the tip through the smoothed hand pose
-    model_sigma_m: float = Field(default=1e-4, gt=0)  # what a linear map leaves
+    model_sigma_m: float = Field(default=1e-4, gt=0)  # what a linear map leaves, per frame
+    common_sigma_m: float = Field(default=8e-5, ge=0)  # and what it leaves in all frames alike, per axis
+    # frames' variance is measured in Stage I, but slow errors do not show there: never below this share of the assumed
+    least_noise: float = Field(default=0.25, gt=0)
     outlier: float = Field(default=6.0, gt=0)  # whitened residual of a frame in which the tip did not rest
     iterations: int = Field(default=15, ge=3)
 
@@ -66,6 +69,7 @@ class Solution:
         learned: (19,) which of them were free.
         rms: Root mean square residual, m.
         factor: How many frames say the same.
+        noise: Variance of the frames' residuals over the assumed.
         r: (T, 3) residuals in F_E, m.
         delta: (T, 6) corrections of the motions.
         weights: (T,) robust weights.
@@ -76,6 +80,7 @@ class Solution:
     learned: BoolArray
     rms: float
     factor: float
+    noise: float
     r: FloatArray
     delta: FloatArray
     weights: FloatArray
@@ -234,7 +239,9 @@ class Solver:
         A, S_inv, _, _ = self._linearise(theta, delta)
         r = self._linearise(theta, np.zeros_like(delta))[2]
         rested = weights > 0.1
-        factor = inflation(r[rested], S_inv[rested])
+        variance, correlation = residual_noise(r[rested], S_inv[rested])
+        noise = max(variance, self._config.least_noise)
+        factor = noise * correlation
         N = np.einsum("tij,tik->jk", A, weights[:, None, None] * (S_inv @ A), optimize=True) / factor
         N[C, C] -= self._spurious(S_inv, weights) / factor
         N += self._prior_N
@@ -251,7 +258,12 @@ class Solver:
             covariance[np.ix_(h, f)] = P_h @ K.T
             covariance[np.ix_(h, h)] = P_h
         rms = float(np.sqrt(np.average(np.sum(r * r, axis=1), weights=np.maximum(weights, 1e-9))))
-        return Solution(theta, covariance, free, rms, factor, r, delta, weights)
+        for part in (C, P):
+            covariance[part, part] += self._config.common_sigma_m**2 * np.eye(3)
+        correlated = max(1.0, variance * correlation)
+        for part in (TAU, DRIFT):  # gels lag and creep is no straight line: no less than assumed
+            covariance[part, part] *= max(1.0, correlated / factor)
+        return Solution(theta, covariance, free, rms, correlated, noise, r, delta, weights)
 
     def checks(self, best: Solution) -> AnchorChecks:
         """Stage I against itself: its halves, frames predicted from the others, and the prior (one step each)."""
