@@ -321,9 +321,10 @@ class FullEstimator:
             self._log.note("latency-changed", pair.stamp_ns, pair.stamp_ns, detail)
         variance, limit = tip_map.covariance[P, P], self._config.refuse_sigma_m
         better = np.trace(variance) < np.trace(self._anchoring.tip_map.covariance[P, P])
-        if weak_axes(variance, limit) or not (self._verdict.slipped or better):
+        if weak_axes(variance, limit) or not (self._verdict.slipped or better or renewed.contradicts):
             return
         self._anchoring, self._last_motion = renewed.anchoring, None
+        self._monitor.restart()
         self._verdict.slipped = False
         self._closure_m = max(self._closure_m or 0.0, renewed.off_m)
         sigma = np.sqrt(np.linalg.eigvalsh(variance)[-1]) * 1e3

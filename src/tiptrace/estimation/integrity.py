@@ -58,6 +58,13 @@ class Monitor:
         self._unseen = np.zeros(0, dtype=int)
         self._twisted = 0
 
+    def restart(self) -> None:
+        """Judge against another reference from here on: displacements start from another template."""
+        self._watch = ContactWatch(self._config)
+        self._slip = SlipDetector(self._config.slip)
+        self._last_residual = None
+        self._twisted = 0
+
     def repeated(self, x_S: FloatArray, pad: FloatArray) -> tuple[bool, bool]:
         """Whether each finger's frame equals the last one; call once per frame, first."""
         same = [False, False]

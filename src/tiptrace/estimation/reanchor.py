@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import dataclass
 
@@ -9,9 +10,10 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from tiptrace.errors import GeometryError
+from tiptrace.estimation.observability import weak_axes
 from tiptrace.estimation.pads import PadMarkers
 from tiptrace.estimation.stage_one import Anchoring, StageOne
-from tiptrace.estimation.tip_map import TipMap
+from tiptrace.estimation.tip_map import P, TipMap
 from tiptrace.geometry.transforms import rotation_log
 from tiptrace.types import FloatArray, SensedPair
 
@@ -21,13 +23,25 @@ class ReanchorConfig(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    window_s: float = Field(default=3.0, gt=0)
+    window_s: float = Field(default=5.0, gt=0)  # at most
+    least_s: float = Field(default=2.0, gt=0)
+    away_m: float = Field(default=1.2e-3, gt=0)  # of the last second's place: the tip was on its way there
     spread_m: float = Field(default=8e-4, gt=0)  # of the estimate, slip error included, about its mean
     turn_rad: float = Field(default=0.08, gt=0)  # range of the hand's orientation within the window
+    sigma_m: float = Field(
+        default=1e-3, gt=0
+    )  # of the new anchor on any axis; waits for more motion until then
     every: int = Field(default=12, ge=1)  # frames between attempts
     latency_std_s: float = Field(default=0.02, gt=0)  # by which the time offset may have changed
     latency_sigmas: float = Field(default=4.0, gt=0)  # a change beyond is told
     latency_change_s: float = Field(default=0.010, gt=0)
+    latency_sigma_s: float = Field(default=0.004, gt=0)  # vaguer ones are not believed
+    latency_most_s: float = Field(default=0.050, gt=0)  # nor are changes beyond
+    latency_held_s: float = Field(default=0.002, gt=0)  # uncertainty of a time offset that has not changed
+    slack_m: float = Field(default=3e-4, gt=0)  # of a trace that is as good as its anchor
+    contradiction: float = Field(
+        default=16.3, gt=0
+    )  # χ² of three axes at which one anchor must be wrong (99.9 %)
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,11 +58,13 @@ class Renewed:
     Attributes:
         anchoring: What the window gave.
         off_m: How far off the trace was there.
+        contradicts: Whether it was further off than both anchors' uncertainties explain.
         latency_change_s: New latency less the old one where they differ for certain, else None.
     """
 
     anchoring: Anchoring
     off_m: float
+    contradicts: bool
     latency_change_s: float | None
 
 
@@ -68,33 +84,72 @@ class Reanchoring:
         self._segment.add_poses(pair.poses)
         self._segment.add(pair.stamp_ns, markers)
         self._rows.append(_Row(pair.stamp_ns, p_B, R_B_E))
-        start_ns = pair.stamp_ns - round(self._config.window_s * 1e9)
-        complete = self._rows[0].stamp_ns <= start_ns
-        while self._rows[0].stamp_ns < start_ns:
-            self._rows.popleft()
-        self._segment.keep_from(start_ns)
+        self._forget(pair.stamp_ns - round(self._config.window_s * 1e9))
         self._count += 1
-        if not complete or self._count % self._config.every or not self._rests():
+        if self._count % self._config.every or not self._rests(pair.stamp_ns):
             return None
-        try:
-            anchoring = self._segment.solve((known.latency_s, self._config.latency_std_s), None, known)
-        except (GeometryError, np.linalg.LinAlgError):
+        anchoring = self._solved(known)
+        if anchoring is None:
             return None
-        off = np.median(np.stack([r.p_B for r in self._rows]), axis=0) - anchoring.tip_map.p
+        tip_map = anchoring.tip_map
+        off = np.median(np.stack([r.p_B for r in self._rows]), axis=0) - tip_map.p
         self._segment, self._count = self._like.fresh(), 0
         self._rows.clear()
-        return Renewed(anchoring, float(np.linalg.norm(off)), self._latency_change(anchoring.tip_map, known))
+        return Renewed(
+            anchoring,
+            float(np.linalg.norm(off)),
+            self._contradicts(off, tip_map, known),
+            self._latency_change(tip_map, known),
+        )
+
+    def _solved(self, known: TipMap) -> Anchoring | None:
+        """The window's anchor, None while it is too vague.
+
+        What creeps in a short window looks like another time offset: unless that is certain, the old one holds.
+        """
+        c = self._config
+        try:
+            anchoring = self._segment.solve((known.latency_s, c.latency_std_s), None, known)
+            if weak_axes(anchoring.tip_map.covariance[P, P], c.sigma_m):
+                return None
+            if self._latency_change(anchoring.tip_map, known) is None:
+                anchoring = self._segment.solve((known.latency_s, c.latency_held_s), None, known)
+        except (GeometryError, np.linalg.LinAlgError):
+            return None
+        return None if weak_axes(anchoring.tip_map.covariance[P, P], c.sigma_m) else anchoring
+
+    def _contradicts(self, off: FloatArray, now: TipMap, before: TipMap) -> bool:
+        """Whether both anchors cannot be right, by the distance (3,) of the trace from where the tip rests."""
+        covariance = now.covariance[P, P] + before.covariance[P, P] + self._config.slack_m**2 * np.eye(3)
+        return bool(off @ np.linalg.solve(covariance, off) > self._config.contradiction)
 
     def _latency_change(self, now: TipMap, before: TipMap) -> float | None:
         change = now.latency_s - before.latency_s
-        sigma = float(np.sqrt(now.covariance[15, 15] + before.covariance[15, 15]))
+        own = float(np.sqrt(now.covariance[15, 15]))
+        sigma = math.hypot(own, float(np.sqrt(before.covariance[15, 15])))
         certain = abs(change) > max(self._config.latency_sigmas * sigma, self._config.latency_change_s)
-        return change if certain and bool(now.learned[15]) else None
+        sure = own < self._config.latency_sigma_s and abs(change) < self._config.latency_most_s
+        return change if certain and sure and bool(now.learned[15]) else None
 
-    def _rests(self) -> bool:
+    def _forget(self, stamp_ns: int) -> None:
+        while self._rows[0].stamp_ns < stamp_ns:
+            self._rows.popleft()
+        self._segment.keep_from(stamp_ns)
+
+    def _rests(self, now_ns: int) -> bool:
+        """Whether the tip has rested for long enough under a turning hand; forgets how it got there."""
         p = np.stack([r.p_B for r in self._rows])
-        middle = np.median(p, axis=0)
-        spread = float(np.sqrt(np.median(np.sum((p - middle) ** 2, axis=1))))
+        stamps = np.array([r.stamp_ns for r in self._rows])
+        here = np.median(p[stamps > now_ns - 10**9], axis=0)
+        away = np.flatnonzero(np.linalg.norm(p - here, axis=1) > self._config.away_m)
+        if away.size and away[-1] == len(p) - 1:
+            return False
+        if away.size:
+            self._forget(int(stamps[away[-1] + 1]))
+            p = p[away[-1] + 1 :]
+        if now_ns - self._rows[0].stamp_ns < self._config.least_s * 1e9:
+            return False
+        spread = float(np.sqrt(np.median(np.sum((p - np.median(p, axis=0)) ** 2, axis=1))))
         R = np.stack([r.R_B_E for r in self._rows])
         turn = float(np.linalg.norm(rotation_log(R[0].T @ R), axis=1).max())
         return spread < self._config.spread_m and turn > self._config.turn_rad
