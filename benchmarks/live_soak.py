@@ -109,7 +109,7 @@ class Watch:
         truth = trial.recording.truth()
         self._truth_s = np.array([(t.stamp_ns - trial.first_ns) * 1e-9 + trial.latency_s for t in truth])
         self._truth = np.stack([t.p_B for t in truth])
-        self.rows: list[tuple[float, Status, Phase | None, float]] = []
+        self.rows: list[tuple[float, Status, Phase | None, float, bool]] = []
         self.notes: tuple[str, ...] = ()
         self.last = time.monotonic()
         self.longest_silence_s = 0.0
@@ -127,7 +127,7 @@ class Watch:
             s = phase if phase <= D else 2 * D - phase
             true = [np.interp(s, self._truth_s, self._truth[:, i]) for i in range(3)]
             error = float(np.linalg.norm(e.p_B - true))
-        self.rows.append((t_s, e.status, e.phase, error))
+        self.rows.append((t_s, e.status, e.phase, error, snapshot.latency_ms is not None))
         self.notes = snapshot.notes
         if now - self._start > self._end_s:
             self._session.stop()
@@ -198,7 +198,7 @@ def judge(watch: Watch, faults: tuple[Fault, ...]) -> bool:
     wrong = claimed & (error > usual + SILENT_ERROR_M)
     say("silently wrong ('ok', 3 mm off)", f"{int(wrong.sum())} of {int(claimed.sum())}")
     tell_wrong(t, error, wrong, faults)
-    unmarked = after_a_pause(t, np.isfinite(error)) & (status == "ok") & late
+    unmarked = after_a_pause(t, np.array([row[4] for row in watch.rows])) & (status == "ok") & late
     say("'ok' right after a pause", f"{int(unmarked.sum())}")
     tell_wrong(t, error, unmarked, faults)
     say("status about faults", str(dict(Counter(status[touched].tolist()))))
@@ -212,7 +212,7 @@ def spread(error: FloatArray) -> str:
 
 
 def after_a_pause(t: FloatArray, known: BoolArray) -> BoolArray:
-    """Pairs with a position whose predecessor with one is more than two periods older."""
+    """Pairs whose predecessor is more than two periods older."""
     found, last = np.zeros(len(t), dtype=bool), t[0]
     for k in np.flatnonzero(known):
         found[k] = t[k] - last > PAUSE_S

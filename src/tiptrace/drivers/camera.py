@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 
 from tiptrace.drivers.base import Closing, DeviceHealth, DeviceStatus, Frame, FrameTap, Wake
-from tiptrace.drivers.jpeg_scan import warm_up
+from tiptrace.drivers.jpeg_scan import ScanFacts, warm_up
 from tiptrace.drivers.meter import Meter
 from tiptrace.drivers.picture import Framing, Novelty, PictureError, decode_jpeg, encode_jpeg, inspect_jpeg
 from tiptrace.drivers.timeline import NS, Timeline
@@ -246,7 +246,7 @@ class ThreadedCamera(Closing):
         """
         facts, reduction, source = None, 1, raw.image
         if raw.jpeg is not None:
-            facts = inspect_jpeg(raw.jpeg)
+            facts = self._inspect(raw.jpeg)
             reduction = self._framing.reduction(facts.size_px)
             source = decode_jpeg(raw.jpeg, reduction)
         assert source is not None
@@ -260,3 +260,10 @@ class ThreadedCamera(Closing):
             return Frame(raw.stamp_ns, raw.arrived_ns, image, raw.jpeg)
         jpeg = encode_jpeg(image)
         return Frame(raw.stamp_ns, raw.arrived_ns, decode_jpeg(jpeg), jpeg)
+
+    def _inspect(self, jpeg: bytes) -> ScanFacts:
+        try:
+            return inspect_jpeg(jpeg)
+        except PictureError:
+            self._novelty.broken()
+            raise

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import zlib
-from typing import Any
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from tiptrace.config import Sensor
-from tiptrace.drivers.jpeg_scan import ScanError, ScanFacts, same_camera, walk
+from tiptrace.drivers.jpeg_head import ScanError
+from tiptrace.drivers.jpeg_scan import ScanFacts, same_camera, walk
 from tiptrace.errors import DeviceError
 from tiptrace.types import Image
 
@@ -20,6 +21,7 @@ _BLOCKS = (16, 12)  # of which the picture's means are compared, x and y
 _BLOCK_STEP = 15.0  # grey levels by which a block's mean may change between two frames
 _MANY_BLOCKS = 3
 _SHARPER, _SHARPNESS = 2.0, 16.0  # times the picture before, and grey levels times 8 more
+_ALIKE = 0.1  # of the sharpness of two pictures of the same thing
 _REDUCED = {
     1: cv2.IMREAD_COLOR,
     2: cv2.IMREAD_REDUCED_COLOR_2,
@@ -133,13 +135,36 @@ class Framing:
         return np.ascontiguousarray(image)
 
 
+@dataclass(frozen=True, slots=True)
+class _Look:
+    """What two pictures are compared by: (12, 16, 3) means of their blocks, and what the file told."""
+
+    blocks: NDArray[np.float32]
+    facts: ScanFacts | None
+
+    def jumps_from(self, last: _Look, step: float = _BLOCK_STEP, many: int = _MANY_BLOCKS) -> bool:
+        """Whether parts became brighter or darker, a block much sharper than any, or the tables others."""
+        if self.facts is not None and last.facts is not None:
+            sharper = self.facts.sharpest > _SHARPER * last.facts.sharpest + _SHARPNESS
+            if sharper or not same_camera(last.facts.quantisation, self.facts.quantisation):
+                return True
+        return int((np.abs(self.blocks - last.blocks).max(axis=2) > step).sum()) >= many
+
+    def agrees_with(self, held: _Look) -> bool:
+        """Whether the jump that a picture was held back for has stayed: two damaged ones never look alike."""
+        a, b = self.facts, held.facts
+        if a is not None and b is not None and abs(a.sharpest - b.sharpest) > _ALIKE * b.sharpest + 2.0:
+            return False
+        return not (self.jumps_from(held, 0.5 * _BLOCK_STEP, 1) or held.jumps_from(self))
+
+
 class Novelty:
-    """Tells whether a picture is new, and whether it can follow the one before."""
+    """Tells whether a picture is new, and whether it can follow the last one that could."""
 
     def __init__(self) -> None:
         self._print: int | None = None
-        self._blocks: NDArray[Any] | None = None
-        self._facts: ScanFacts | None = None
+        self._last: _Look | None = None
+        self._held: _Look | None = None
 
     def repeated(self, data: bytes | memoryview) -> bool:
         """Whether these bytes or pixels are those of the picture before; a sensor's noise never repeats."""
@@ -148,22 +173,27 @@ class Novelty:
         self._print = mark
         return same
 
+    def broken(self) -> None:
+        """A picture came that is damaged: what was held back before it may be so too."""
+        self._held = None
+
     def torn(self, image: Image, facts: ScanFacts | None = None) -> bool:
         """Whether the picture jumped, as after a damaged byte, where a gel deforms gradually.
 
-        Parts of it became brighter or darker, one block much sharper than any before, or the quantisation is another,
-        and not a scaled one. A jump that stays is taken at its second frame: lamps may be switched.
+        A jump that stays is taken at its second frame: lamps may be switched.
         """
         blocks = cv2.resize(image, _BLOCKS, interpolation=cv2.INTER_AREA).astype(np.float32)
-        last, self._blocks = self._blocks, blocks
-        before, self._facts = self._facts, facts
-        if last is None:
+        now = _Look(blocks, facts)
+        held, self._held = self._held, None
+        if (
+            self._last is None
+            or not now.jumps_from(self._last)
+            or (held is not None and now.agrees_with(held))
+        ):
+            self._last = now
             return False
-        if facts is not None and before is not None:
-            sharper = facts.sharpest > _SHARPER * before.sharpest + _SHARPNESS
-            if sharper or not same_camera(before.quantisation, facts.quantisation):
-                return True
-        return int((np.abs(blocks - last).max(axis=2) > _BLOCK_STEP).sum()) >= _MANY_BLOCKS
+        self._held = now
+        return True
 
 
 def _size(image: Image) -> tuple[int, int]:

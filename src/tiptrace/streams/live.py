@@ -21,6 +21,7 @@ from tiptrace.streams.synchronise import LIVE, SyncSettings
 from tiptrace.types import SIDES, Image, ImageSample, OpeningSample, Phase, PhaseSample, Sample, Side
 
 _IDLE_S = 0.2
+_ALIKE = 0.6  # of the rates of two cameras of one kind
 _LOOK_S = 0.05  # between two looks at the devices' states
 _WARM_UP_S, _WARM_UP_FRAMES = 2.0, 8
 _SPACING_SHARE = 0.85  # of the measured period between frames: closer ones do not come
@@ -143,7 +144,8 @@ class LiveStream:
         rates = [self._cameras[side].health().rate_hz for side in SIDES]
         known = [rate for rate in rates if rate is not None]
         if len(known) == 2:
-            self.period_s = 1.0 / min(known)
+            alike = min(known) > _ALIKE * max(known)  # else a lost frame made one of them look slower
+            self.period_s = 1.0 / (max(known) if alike else min(known))
             self.settings = replace(LIVE, min_frame_spacing_s=_SPACING_SHARE / max(known))
 
     def begin(self) -> None:
