@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 
 from tiptrace.errors import GeometryError
+from tiptrace.estimation.full import FullEstimator
 from tiptrace.estimation.paper import PaperEstimator
 from tiptrace.sim.spec import make_spec
 from tiptrace.streams.simulated import SimulatedStream
 from tiptrace.streams.synchronise import synchronise
 from tiptrace.tracer import Sensing
-from tiptrace.types import FloatArray, SensedFinger, SensedPair
+from tiptrace.types import FloatArray, SensedFinger, SensedPair, Status
 
 Distort = Callable[[SensedPair], SensedPair]
 
@@ -60,3 +61,21 @@ def test_the_right_arrangement_passes(pairs: list[SensedPair]) -> None:
 def test_a_wrong_arrangement_is_named(pairs: list[SensedPair], sentence: str) -> None:
     with pytest.raises(GeometryError, match=sentence):
         run(pairs, WRONG[sentence])
+
+
+@pytest.mark.parametrize("sentence", WRONG)
+def test_full_refuses_the_anchor_and_names_the_arrangement(pairs: list[SensedPair], sentence: str) -> None:
+    estimator = FullEstimator()
+    estimates = [estimator.update(WRONG[sentence](pair)) for pair in pairs]
+    assert estimator.anchor is None
+    assert estimates[-1].status is Status.UNOBSERVABLE
+    assert estimates[-1].p_B is None
+    (refused,) = [e for e in estimator.events if e.kind == "anchor-refused"]
+    assert sentence in refused.detail
+
+
+def test_full_takes_the_right_arrangement(pairs: list[SensedPair]) -> None:
+    estimator = FullEstimator()
+    for pair in pairs:
+        estimator.update(pair)
+    assert estimator.anchor is not None

@@ -8,6 +8,7 @@ wrong arrangement, and the trial is refused where one of them explains the motio
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +17,7 @@ from tiptrace.errors import GeometryError
 from tiptrace.geometry.fixed_point import FixedPointAccumulator
 from tiptrace.geometry.kabsch import kabsch
 from tiptrace.geometry.transforms import apply
-from tiptrace.types import SIDES, FloatArray, Side
+from tiptrace.types import SIDES, FloatArray, IntArray, SensedPair, Side
 
 _BETTER = (
     1.5  # residual as it is over the alternative's; right data gave at most 1.1 where Stage I moves enough
@@ -104,3 +105,37 @@ def _arranged(
 def _residual_m(fit: FixedPointAccumulator) -> float:
     solution = fit.solve()
     return np.inf if solution is None else solution.residual_m
+
+
+class ArrangementWatch:
+    """The same for the full estimator: every sixth frame, all markers that it trusts at the first of them."""
+
+    def __init__(self, every: int = 6) -> None:
+        """Look at one frame in ``every``."""
+        self._check, self._every, self._frames = ArrangementCheck(), every, 0
+        self._rows: dict[Side, IntArray] = {}
+
+    def add(self, pair: SensedPair, trust: Callable[[], FloatArray]) -> None:
+        """Take an anchoring frame; ``trust()`` gives the weight of every marker (N,), left finger first."""
+        self._frames += 1
+        if self._frames % self._every != 1:
+            return
+        if not self._rows:
+            left, right = np.split(trust(), [len(pair.left.markers.x_S)])
+            self._rows = {"left": np.flatnonzero(left > 0), "right": np.flatnonzero(right > 0)}
+        x_S: dict[Side, FloatArray] = {}
+        T_B_S: dict[Side, FloatArray] = {}
+        for side in SIDES:
+            finger = pair.finger(side)
+            seen = finger.markers.tracked[:, None]
+            x_S[side] = np.where(seen, finger.markers.x_S, np.nan)[self._rows[side]]
+            T_B_S[side] = finger.T_B_E @ finger.T_E_S
+        self._check.add(x_S, T_B_S)
+
+    def complaint(self) -> str | None:
+        """The sentence that names a wrong arrangement once Stage I is over; None where all is right."""
+        try:
+            self._check.verify()
+        except GeometryError as error:
+            return str(error)
+        return None

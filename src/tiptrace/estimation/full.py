@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from tiptrace.config import Rig, Tool
 from tiptrace.estimation.anchor import TipPrior
+from tiptrace.estimation.arrangement import ArrangementWatch
 from tiptrace.estimation.carry_over import StageTwoStep, carried_over
 from tiptrace.estimation.event_log import EventLog
 from tiptrace.estimation.integrity import Findings, IntegrityConfig, Monitor
@@ -94,6 +95,7 @@ class FullEstimator:
         self._stage_one = StageOne(c.stage_one, c.patch, c.motion, c.tip_map, c.pose_half_width_s)
         self._running = RunningTip(self._prior, c.tip_noise_m, c.tip_map.map_sigma)
         self._phases = PhaseDetector(c.phases)
+        self._arrangement = ArrangementWatch()
         self._monitor = Monitor(c.integrity)
         self._reanchoring = Reanchoring(c.reanchor, self._stage_one)
         self._fit_I: TemplateFit | None = None
@@ -168,6 +170,8 @@ class FullEstimator:
         n = len(self._stage_one)
         if n in (1, 2, _TEMPLATE_FRAMES):
             self._fit_I, self._last_motion = self._stage_one.first_fit(), None
+        if n >= _TEMPLATE_FRAMES:
+            self._arrangement.add(pair, self._stage_one.trust)
         assert self._fit_I is not None
         motions = self._fit(self._fit_I, markers)
         stamp_ns = self._exposure_ns(pair.stamp_ns)
@@ -193,7 +197,12 @@ class FullEstimator:
         if len(self._stage_one) >= _TEMPLATE_FRAMES and self._staged:
             if self._phases.end_ns is not None:
                 self._stage_one.keep_until(self._phases.end_ns)
-            self._accept(self._stage_one.solve(self._latency, self._prior), pair.stamp_ns)
+            complaint = self._arrangement.complaint() if self._marked else None
+            if complaint is None:
+                self._accept(self._stage_one.solve(self._latency, self._prior), pair.stamp_ns)
+            else:
+                self._anchoring = self._stage_one.assume(self._unknown_tip(), self._latency)
+                self._refuse(pair.stamp_ns, complaint)
             return True
         self._stage_one.add_poses(poses)
         self._stage_one.add(pair.stamp_ns, markers)
@@ -205,12 +214,19 @@ class FullEstimator:
             return True
         if tip is None:
             self._relative = True
-            away, sigma = self._config.unknown_tip_m
-            tip = TipPrior(
-                self._stage_one.centre_E + [0.0, 0.0, away], np.diag([0.5 * sigma, 0.5 * sigma, sigma]) ** 2
-            )
+            tip = self._unknown_tip()
         self._anchoring = self._stage_one.assume(tip, self._latency)
         return True
+
+    def _unknown_tip(self) -> TipPrior:
+        """Somewhere beyond the pads: a lever is needed even where no position is claimed."""
+        away, sigma = self._config.unknown_tip_m
+        covariance = np.diag([0.5 * sigma, 0.5 * sigma, sigma]) ** 2
+        return TipPrior(self._stage_one.centre_E + [0.0, 0.0, away], covariance)
+
+    def _refuse(self, stamp_ns: int, why: str) -> None:
+        self._refused = True
+        self._log.note("anchor-refused", stamp_ns, stamp_ns, why)
 
     def _accept(self, anchoring: Anchoring, stamp_ns: int) -> None:
         """Take the anchor, or refuse it and say which motion is missing."""
@@ -221,13 +237,7 @@ class FullEstimator:
         covariance = tip_map.covariance[P, P]
         weak = weak_axes(covariance, limit)
         if weak:
-            self._refused = True
-            self._log.note(
-                "anchor-refused",
-                stamp_ns,
-                stamp_ns,
-                advice(weak, covariance, anchoring.tool_rotations, limit),
-            )
+            self._refuse(stamp_ns, advice(weak, covariance, anchoring.tool_rotations, limit))
             return
         self._anchor = Anchor(
             tip_map.p, covariance, tip_map.residual_m, tip_map.frames, checks=tip_map.checks
