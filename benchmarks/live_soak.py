@@ -116,7 +116,8 @@ class Watch:
 
     def __call__(self, snapshot: Snapshot) -> None:
         now, e = time.monotonic(), snapshot.estimate
-        self.longest_silence_s = max(self.longest_silence_s, now - self.last)
+        if self.rows:  # before there is the time to open everything
+            self.longest_silence_s = max(self.longest_silence_s, now - self.last)
         self.last = now
         timeline = self._session.stream.timeline
         t_s = (e.stamp_ns - timeline.offset_ns) * 1e-9 - self._start

@@ -18,8 +18,11 @@ from tiptrace.types import Image
 JPEG_QUALITY = 95
 _FLIP = {"horizontal": 1, "vertical": 0, "both": -1}
 _BLOCKS = (16, 12)  # of which the picture's means are compared, x and y
-_BLOCK_STEP = 15.0  # grey levels by which a block's mean may change between two frames
-_MANY_BLOCKS = 3
+_BLOCK_STEP, _MANY_BLOCKS = (
+    40.0,
+    6,
+)  # grey levels by which the means of so many change where no gel moves like that
+_SAME_STEP, _SAME_BLOCKS = 20.0, 3  # the same between two pictures of one thing
 _SHARPER, _SHARPNESS = 2.0, 16.0  # times the picture before, and grey levels times 8 more
 _ALIKE = 0.1  # of the sharpness of two pictures of the same thing
 _REDUCED = {
@@ -155,7 +158,7 @@ class _Look:
         a, b = self.facts, held.facts
         if a is not None and b is not None and abs(a.sharpest - b.sharpest) > _ALIKE * b.sharpest + 2.0:
             return False
-        return not (self.jumps_from(held, 0.5 * _BLOCK_STEP, 1) or held.jumps_from(self))
+        return not (self.jumps_from(held, _SAME_STEP, _SAME_BLOCKS) or held.jumps_from(self))
 
 
 class Novelty:
