@@ -6,14 +6,13 @@ import json
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from tiptrace.config import Rig, Tool
-from tiptrace.errors import ConfigError, TipTraceError
+from tiptrace.errors import ConfigError, MissingExtraError, TipTraceError
 from tiptrace.evaluation.analytic import CENTRELINES, analytic_truth
 from tiptrace.evaluation.conditions import Condition
 from tiptrace.evaluation.error_series import initial_point
@@ -23,11 +22,12 @@ from tiptrace.evaluation.truth import Truth
 from tiptrace.evaluation.truth_files import read_truth
 from tiptrace.pipeline import Step, replay, trace
 from tiptrace.reconstruction import Trial, reconstruct
-from tiptrace.sim.simulation import START_NS, Frame
+from tiptrace.sim.simulation import Frame
 from tiptrace.sim.spec import make_spec
 from tiptrace.streams.simulated import SimulatedStream
 from tiptrace.streams.sources import open_recording
 from tiptrace.streams.sync_report import SyncReport
+from tiptrace.streams.true_events import TrueEvents, from_frames, from_table, truth_table_of
 from tiptrace.tracer import TruthAt, make_tracer, sensing_of
 from tiptrace.types import (
     SIDES,
@@ -43,8 +43,6 @@ from tiptrace.types import (
     TruthSample,
 )
 
-_LEAST_EVENT_S = 0.1
-
 
 def run_trial(task: TrialTask, methods: Sequence[str]) -> TrialRun:
     """Run a trial; its source is JSON of :func:`recording_source` or :func:`simulated_source`.
@@ -53,14 +51,15 @@ def run_trial(task: TrialTask, methods: Sequence[str]) -> TrialRun:
         TipTraceError: the trial cannot be read or simulated; the failure of a single method is in the result.
     """
     source = json.loads(task.source)
-    stream, events = _open(source)
+    stream, real = _open(source)
     task = described(task, stream.trial)
     samples = read_truth(Path(source["truth"])) if source.get("truth") else stream.truth()
     truth = Truth.from_samples(samples) if samples else None
     found = _Traced(stream, truth)
     found.run(methods)
     analytic = _analytic(found, truth, source["analytic"], task) if source.get("analytic") else None
-    return TrialRun(found.trajectories, truth, analytic, found.failures, events, task)
+    events, slight = (None, ()) if real is None else (real.events, real.slight)
+    return TrialRun(found.trajectories, truth, analytic, found.failures, events, slight, task)
 
 
 def report_trial(task: TrialTask, methods: Sequence[str], folder: Path) -> Path | None:
@@ -95,14 +94,23 @@ def recording_source(
     return json.dumps(values, sort_keys=True)
 
 
-def _open(source: dict[str, Any]) -> tuple[Trial, tuple[Event, ...] | None]:
+def _open(source: dict[str, Any]) -> tuple[Trial, TrueEvents | None]:
     """The trial of a source, and what really happened in it, where that is known."""
     if "spec" in source:
         simulated = _Collected.simulate(source["spec"])
         return simulated, simulated.true_events
     plain = {"reference_frames", "stamps"}
     options: dict[str, Any] = {k: v if k in plain else Path(v) for k, v in source.get("options", {}).items()}
-    return open_recording(Path(source["path"]), **options), None
+    path = Path(source["path"])
+    return open_recording(path, **options), _recorded_events(truth_table_of(path))
+
+
+def _recorded_events(table: Path) -> TrueEvents | None:
+    """From the truth that a simulated recording has beside it, where there is one and it can be read."""
+    try:
+        return from_table(table) if table.is_file() else None
+    except MissingExtraError:
+        return None
 
 
 def described(task: TrialTask, trial: dict[str, Any]) -> TrialTask:
@@ -214,7 +222,7 @@ class _Collected:
     gel_models: dict[str, bytes]
     trial: dict[str, Any]
     samples: list[Sample]
-    true_events: tuple[Event, ...]
+    true_events: TrueEvents
     notes: list[str] = field(default_factory=list)
 
     @classmethod
@@ -222,26 +230,14 @@ class _Collected:
         frames: list[Frame] = []
         stream = SimulatedStream(make_spec(**values), frames.append)
         samples = list(stream)
-        events = (*_runs(frames, "contact-lost"), *_runs(frames, "grasp-slip"))
-        trial = stream.trial_metadata
-        return cls(stream.rig, stream.tool, stream.references, stream.gel_models, trial, samples, events)
+        trial, real = stream.trial_metadata, from_frames(frames)
+        return cls(stream.rig, stream.tool, stream.references, stream.gel_models, trial, samples, real)
 
     def __iter__(self) -> Iterator[Sample]:
         return iter(self.samples)
 
     def truth(self) -> list[TruthSample]:
         return [s for s in self.samples if isinstance(s, TruthSample)]
-
-
-def _runs(frames: Sequence[Frame], kind: str) -> Iterator[Event]:
-    """Intervals of the reconstruction segment in which the tip is off the plate, or the tool creeps in the grasp."""
-    late = [f.state for f in frames if f.state.phase is Phase.RECONSTRUCTION]
-    flags = [not s.in_contact if kind == "contact-lost" else s.creeping for s in late]
-    for flag, group in groupby(zip(flags, late, strict=True), key=lambda pair: pair[0]):
-        states = [state for _, state in group]
-        if flag and states[-1].t_s - states[0].t_s >= _LEAST_EVENT_S:
-            start, end = (START_NS + round(s.t_s * 1e9) for s in (states[0], states[-1]))
-            yield Event(kind, start, end, "true")
 
 
 def _analytic(found: _Traced, truth: Truth | None, wanted: dict[str, Any], task: TrialTask) -> Truth | None:

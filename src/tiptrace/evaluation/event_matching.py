@@ -18,25 +18,36 @@ class EventScore:
         hits: True events that overlap a detected one.
         misses: True events that do not.
         false_alarms: Detected events that overlap no true one.
-        mean_delay_s: From the start of a true event to that of its detection, over the hits; NaN without any.
+        delays_s: From the start of a true event to that of its detection, for each hit.
     """
 
     hits: int = 0
     misses: int = 0
     false_alarms: int = 0
-    mean_delay_s: float = float("nan")
+    delays_s: tuple[float, ...] = ()
+
+    @property
+    def mean_delay_s(self) -> float:
+        """Over the hits; NaN without any."""
+        return sum(self.delays_s) / len(self.delays_s) if self.delays_s else float("nan")
 
 
 def score_events(
-    detected: Sequence[Event], true: Sequence[Event], kind: str, tolerance_s: float = DEFAULT_TOLERANCE_S
+    detected: Sequence[Event],
+    true: Sequence[Event],
+    kind: str,
+    tolerance_s: float = DEFAULT_TOLERANCE_S,
+    slight: Sequence[Event] = (),
 ) -> EventScore:
     """Match events of one kind that overlap when both are widened by a tolerance.
 
-    One long detection may cover several true events, and one true event may be told in several pieces.
+    One long detection may cover several true events, and one true event may be told in several pieces. Events that
+    are too ``slight`` to be told count in nothing: neither missed, nor is one that is told false.
     """
     slack = round(tolerance_s * 1e9)
     seen = [e for e in detected if e.kind == kind]
     real = [e for e in true if e.kind == kind]
+    happened = real + [e for e in slight if e.kind == kind]
     delays = []
     for event in real:
         matches = [e for e in seen if _overlap(e, event, slack)]
@@ -45,8 +56,8 @@ def score_events(
     return EventScore(
         hits=len(delays),
         misses=len(real) - len(delays),
-        false_alarms=sum(not any(_overlap(e, event, slack) for event in real) for e in seen),
-        mean_delay_s=sum(delays) / len(delays) if delays else float("nan"),
+        false_alarms=sum(not any(_overlap(e, event, slack) for event in happened) for e in seen),
+        delays_s=tuple(delays),
     )
 
 

@@ -30,6 +30,7 @@ _TEXTS = (
     "failure",
     "report",
     "events",
+    "event_delays_s",
 )
 
 
@@ -48,6 +49,7 @@ class TrialRecord:
         failure: Why there is no result; empty where there is one.
         analytic: Errors against the paper's analytic curve, by metric, where that was asked for.
         events: Hits, misses and false alarms by kind, where the true events are known.
+        event_delays_s: How late each hit was told, by kind.
         report: Path of the trial's own report, relative to the suite's.
     """
 
@@ -61,6 +63,7 @@ class TrialRecord:
     failure: str = ""
     analytic: Mapping[str, float] | None = None
     events: Mapping[str, tuple[int, int, int]] | None = None
+    event_delays_s: Mapping[str, tuple[float, ...]] | None = None
     report: str = ""
 
     def value(self, metric: str) -> float:
@@ -94,7 +97,8 @@ def to_row(record: TrialRecord) -> dict[str, Any]:
         "verdict": record.verdict,
         "failure": record.failure,
         "report": record.report,
-        "events": None if record.events is None else json.dumps(dict(record.events), sort_keys=True),
+        "events": _as_json(record.events),
+        "event_delays_s": _as_json(record.event_delays_s),
     }
     for field in fields(TrialMetrics):
         value = getattr(record.metrics, field.name) if record.metrics else None
@@ -118,7 +122,6 @@ def from_row(row: Mapping[str, Any]) -> TrialRecord:
     analytic = {
         name: float(row[f"analytic_{name}"]) for name in _ANALYTIC if row[f"analytic_{name}"] is not None
     }
-    events = None if row["events"] is None else {k: tuple(v) for k, v in json.loads(row["events"]).items()}
     return TrialRecord(
         trial=row["trial"],
         method=row["method"],
@@ -129,7 +132,8 @@ def from_row(row: Mapping[str, Any]) -> TrialRecord:
         verdict=row["verdict"] or "",
         failure=row["failure"] or "",
         analytic=analytic or None,
-        events=events,
+        events=_from_json(row["events"]),
+        event_delays_s=_from_json(row.get("event_delays_s")),  # older files have none
         report=row["report"] or "",
     )
 
@@ -180,21 +184,8 @@ def _metrics(row: Mapping[str, Any]) -> TrialMetrics:
 def _parquet_bytes(rows: list[dict[str, Any]]) -> bytes:
     pa, parquet = _pyarrow()
     names = list(to_row(TrialRecord("", "")))
-    text = {
-        "trial",
-        "method",
-        "trajectory",
-        "tool",
-        "wrist",
-        "grasp",
-        "level",
-        "verdict",
-        "failure",
-        "report",
-        "events",
-    }
     types = {
-        n: pa.string() if n in text else pa.int64() if n in _COUNTS | {"seed"} else pa.float64()
+        n: pa.string() if n in _TEXTS else pa.int64() if n in _COUNTS | {"seed"} else pa.float64()
         for n in names
     }
     table = pa.Table.from_pylist(rows, schema=pa.schema(list(types.items())))
@@ -229,6 +220,14 @@ def _pyarrow() -> tuple[Any, Any]:
     except ImportError:
         raise MissingExtraError("pyarrow", "tables") from None
     return pyarrow, pyarrow.parquet
+
+
+def _as_json(counts: Mapping[str, tuple[float, ...]] | None) -> str | None:
+    return None if counts is None else json.dumps(dict(counts), sort_keys=True)
+
+
+def _from_json(text: str | None) -> dict[str, Any] | None:
+    return None if text is None else {kind: tuple(values) for kind, values in json.loads(text).items()}
 
 
 def _known(value: float | None) -> float | None:

@@ -53,6 +53,7 @@ class TrialRun:
         analytic: The paper's analytic truth, where asked for.
         failures: Why a method gave no trajectory, by method.
         true_events: What really happened; None where nobody knows.
+        slight_events: What happened too, but need not be told.
         task: The task with what its source told of condition, level and seed; None where it told nothing.
     """
 
@@ -61,6 +62,7 @@ class TrialRun:
     analytic: Truth | None = None
     failures: Mapping[str, str] = field(default_factory=dict)
     true_events: tuple[Event, ...] | None = None
+    slight_events: tuple[Event, ...] = ()
     task: TrialTask | None = None
 
 
@@ -108,16 +110,17 @@ def _record(task: TrialTask, run: TrialRun, method: str) -> TrialRecord:
     trajectory = run.trajectories.get(method)
     if trajectory is None:
         return failed(task, [method], run.failures.get(method, "no result")).records[0]
-    events = None
+    scores = {}
     if run.true_events is not None:
-        scores = {kind: score_events(trajectory.events, run.true_events, kind) for kind in _EVENT_KINDS}
-        events = {kind: (s.hits, s.misses, s.false_alarms) for kind, s in scores.items()}
+        told, real, slight = trajectory.events, run.true_events, run.slight_events
+        scores = {kind: score_events(told, real, kind, slight=slight) for kind in _EVENT_KINDS}
     return replace(
         _blank(task, method),
         metrics=evaluate(trajectory, run.truth),
         verdict=assess(trajectory).verdict,
         analytic=analytic_errors(evaluate(trajectory, run.analytic)) if run.analytic is not None else None,
-        events=events,
+        events={kind: (s.hits, s.misses, s.false_alarms) for kind, s in scores.items()} or None,
+        event_delays_s={kind: s.delays_s for kind, s in scores.items()} or None,
     )
 
 
