@@ -22,6 +22,7 @@ _BLOCK_STEP, _MANY_BLOCKS = (
     40.0,
     6,
 )  # grey levels by which the means of so many change where no gel moves like that
+_SHIFT = 5.0  # grey levels; a real camera's pictures shift by 2.6
 _SAME_STEP, _SAME_BLOCKS = 20.0, 3  # the same between two pictures of one thing
 _SHARPER, _SHARPNESS = 2.0, 16.0  # times the picture before, and grey levels times 8 more
 _ALIKE = 0.1  # of the sharpness of two pictures of the same thing
@@ -151,7 +152,10 @@ class _Look:
             sharper = self.facts.sharpest > _SHARPER * last.facts.sharpest + _SHARPNESS
             if sharper or not same_camera(last.facts.quantisation, self.facts.quantisation):
                 return True
-        return int((np.abs(self.blocks - last.blocks).max(axis=2) > step).sum()) >= many
+        change = self.blocks - last.blocks
+        if int((np.abs(change).max(axis=2) > step).sum()) >= many:
+            return True
+        return _shift_below_a_row(change) > _SHIFT
 
     def agrees_with(self, held: _Look) -> bool:
         """Whether the jump that a picture was held back for has stayed: two damaged ones never look alike."""
@@ -159,6 +163,17 @@ class _Look:
         if a is not None and b is not None and abs(a.sharpest - b.sharpest) > _ALIKE * b.sharpest + 2.0:
             return False
         return not (self.jumps_from(held, _SAME_STEP, _SAME_BLOCKS) or held.jumps_from(self))
+
+
+def _shift_below_a_row(change: NDArray[np.float32]) -> float:
+    """By how much more the picture changed below some row than above it, levels.
+
+    A damaged number shifts the brightness or colour of all that comes after it; motion and lamps do not.
+    """
+    rows = np.median(change, axis=1)  # (12, 3)
+    total, n = np.cumsum(rows, axis=0), np.arange(1, len(rows))[:, None]
+    above, below = total[:-1] / n, (total[-1] - total[:-1]) / (len(rows) - n)
+    return float(np.abs(below - above)[1:-1].max())
 
 
 class Novelty:
