@@ -18,9 +18,13 @@ def main(kind: str, seconds: float) -> None:
     rclpy.init()
     node = rclpy.create_node("arm")
     if kind == "tf":
-        from tf2_ros import TransformBroadcaster
+        from tf2_msgs.msg import TFMessage
 
-        send = TransformBroadcaster(node).sendTransform
+        publisher = node.create_publisher(TFMessage, "/tf", 50)
+
+        def send(transform: Any) -> None:
+            publisher.publish(TFMessage(transforms=[transform]))
+
     else:
         send = node.create_publisher(PoseStamped, "/ee_pose", 50).publish
     opening = node.create_publisher(Float64, "/gripper/opening", 10)

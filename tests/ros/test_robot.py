@@ -63,8 +63,8 @@ def test_poses_openings_and_marks_from_topics(tmp_path: Path) -> None:
 
 
 def test_poses_from_tf(tmp_path: Path) -> None:
-    if not has("tf2_ros"):
-        pytest.skip("tf2_ros is not in the Python of TIPTRACE_ROS_PYTHON")
+    if not has("tf2_msgs"):
+        pytest.skip("tf2_msgs is not in the Python of TIPTRACE_ROS_PYTHON")
     found = listen("ros2:tf?base=base&end_effector=tool0", tmp_path / "found.json", "tf")
     assert not found["error"]
     check_poses(found["poses"])
@@ -74,5 +74,5 @@ def test_poses_from_tf(tmp_path: Path) -> None:
 @pytest.mark.parametrize("uri", ["ros2", "ros2:tf"])
 def test_silence_or_a_missing_part_is_one_sentence(uri: str, tmp_path: Path) -> None:
     found = listen(uri, tmp_path / "found.json", None)
-    missing = uri == "ros2:tf" and not has("tf2_ros")
-    assert ("tf2_ros is not in this Python" if missing else "no pose within 5 s") in found["error"]
+    missing = uri == "ros2:tf" and not has("tf2_msgs")
+    assert ("tf2_msgs is not in this Python" if missing else "no pose within 5 s") in found["error"]

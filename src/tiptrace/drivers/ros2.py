@@ -11,12 +11,13 @@ import numpy as np
 
 from tiptrace.drivers.base import PoseFrames, RobotTap, Wake
 from tiptrace.drivers.queued_robot import QueuedRobot
+from tiptrace.drivers.tf_chain import TfChain, Transform
 from tiptrace.drivers.timeline import NS, ClockMap, Timeline
 from tiptrace.errors import ConfigError, DeviceError, GeometryError
 from tiptrace.geometry.transforms import rotation_from_quaternion, transform
 from tiptrace.types import FloatArray, OpeningSample, Phase, PhaseSample, PoseSample
 
-_TF_PERIOD_S = 0.01
+_TF_QUEUE = 100
 _OPENING_MAX_M = 0.3
 _FORM = "ros2, ros2:/POSE_TOPIC, with ?phase=/TOPIC&opening=/TOPIC, or ros2:tf?base=base&end_effector=tool0"
 
@@ -53,34 +54,38 @@ def pose_matrix(position: Any, orientation: Any) -> FloatArray | None:
         return None
 
 
-class TfLookup:
-    """T_B_E by the newest transform of a chain, each time that one comes.
+def listen_to_tf(
+    node: Any, base: str, end_effector: str, on_pose: Callable[[int, FloatArray | None], None]
+) -> None:
+    """Subscribe ``/tf`` and ``/tf_static``; stamp (ns) and T_B_E each time that the chain gives a newer one.
 
-    Args:
-        node: Its clock and subscriptions are used.
-        base: Frame B.
-        end_effector: Frame E.
+    The chain is composed here, so that of ROS 2 only the messages are needed. ``on_pose`` is given None for a
+    transform that is none.
 
     Raises:
-        DeviceError: tf2_ros is not installed.
+        DeviceError: tf2_msgs is not installed.
     """
+    kind, qos = load("tf2_msgs.msg").TFMessage, load("rclpy.qos")
+    chain = TfChain(base, end_effector)
 
-    def __init__(self, node: Any, base: str, end_effector: str) -> None:
-        tf2_ros = load("tf2_ros")
-        self._time = load("rclpy.time").Time
-        self._error: Any = tf2_ros.TransformException
-        self._buffer: Any = tf2_ros.Buffer()
-        self._listener: Any = tf2_ros.TransformListener(self._buffer, node)
-        self._base, self._end_effector = base, end_effector
+    def take(message: Any, static: bool) -> None:
+        found = []
+        for item in message.transforms:
+            T = pose_matrix(item.transform.translation, item.transform.rotation)
+            if T is None:
+                on_pose(0, None)
+            else:
+                found.append(
+                    Transform(item.header.frame_id, item.child_frame_id, stamp_ns(item.header.stamp), T)
+                )
+        newest = chain.add(found, static=static)
+        if newest is not None:
+            on_pose(*newest)
 
-    def newest(self) -> tuple[int, FloatArray] | None:
-        """Stamp (ns) and T_B_E; None where the chain is not complete."""
-        try:
-            found = self._buffer.lookup_transform(self._base, self._end_effector, self._time())
-        except self._error:
-            return None
-        T = pose_matrix(found.transform.translation, found.transform.rotation)
-        return None if T is None else (stamp_ns(found.header.stamp), T)
+    best = qos.QoSProfile(depth=_TF_QUEUE, reliability=qos.ReliabilityPolicy.BEST_EFFORT)
+    latched = qos.QoSProfile(depth=_TF_QUEUE, durability=qos.DurabilityPolicy.TRANSIENT_LOCAL)
+    node.create_subscription(kind, "/tf", lambda message: take(message, False), best)
+    node.create_subscription(kind, "/tf_static", lambda message: take(message, True), latched)
 
 
 class Ros2Robot(QueuedRobot):
@@ -107,7 +112,6 @@ class Ros2Robot(QueuedRobot):
         self._rclpy = load("rclpy")
         self._clock = ClockMap()
         self._base: str | None = options.get("base") if topic == "tf" else None
-        self._last_tf = -1
 
     @property
     def frames(self) -> PoseFrames:
@@ -135,10 +139,8 @@ class Ros2Robot(QueuedRobot):
     def _subscribe(self, node: Any) -> None:
         qos = load("rclpy.qos").qos_profile_sensor_data
         if self._topic == "tf":
-            lookup = TfLookup(
-                node, self._options.get("base", "base"), self._options.get("end_effector", "tool0")
-            )
-            node.create_timer(_TF_PERIOD_S, lambda: self._on_tf(lookup))
+            base, end_effector = self._options.get("base", "base"), self._options.get("end_effector", "tool0")
+            listen_to_tf(node, base, end_effector, self._put_pose)
         else:
             node.create_subscription(
                 load("geometry_msgs.msg").PoseStamped, self._topic, self._guarded(self._on_pose), qos
@@ -175,12 +177,6 @@ class Ros2Robot(QueuedRobot):
         self._base = message.header.frame_id or self._base
         T = pose_matrix(message.pose.position, message.pose.orientation)
         self._put_pose(stamp_ns(message.header.stamp), T)
-
-    def _on_tf(self, lookup: TfLookup) -> None:
-        found = lookup.newest()
-        if found is not None and found[0] != self._last_tf:
-            self._last_tf = found[0]
-            self._put_pose(*found)
 
     def _put_pose(self, stamp: int, T_B_E: FloatArray | None) -> None:
         if T_B_E is None:

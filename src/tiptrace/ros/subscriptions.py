@@ -8,7 +8,7 @@ from functools import partial
 from typing import Any
 
 from tiptrace.config import Rig
-from tiptrace.drivers.ros2 import TfLookup, load, stamp_ns
+from tiptrace.drivers.ros2 import listen_to_tf, load, stamp_ns
 from tiptrace.errors import ConfigError
 from tiptrace.ros.stream import RosStream
 from tiptrace.streams.mapping import MapFile
@@ -20,9 +20,8 @@ from tiptrace.streams.messages import (
     phase_from,
     pose_from,
 )
-from tiptrace.types import SIDES, ImageSample, OpeningSample, PhaseSample, PoseSample, Side
+from tiptrace.types import SIDES, FloatArray, ImageSample, OpeningSample, PhaseSample, PoseSample, Side
 
-_TF_PERIOD_S = 0.005
 _SHOW_EVERY_S = 5.0
 
 
@@ -75,9 +74,7 @@ class Subscriptions:
         if topics.pose:
             self._subscribe(load("geometry_msgs.msg").PoseStamped, topics.pose, self._pose, qos)
         else:
-            lookup = TfLookup(node, self._rig.frames.base, topics.end_effector)
-            self._tf_ns = -1
-            node.create_timer(_TF_PERIOD_S, lambda: self._tf(lookup))
+            listen_to_tf(node, self._rig.frames.base, topics.end_effector, self._tf)
         std = load("std_msgs.msg")
         self._subscribe(std.String, topics.phase, self._phase, 10)
         if topics.opening:
@@ -114,11 +111,11 @@ class Subscriptions:
         T_B_E = pose_from(message.pose.position, message.pose.orientation)
         self._stream.put(PoseSample(self._dated(message), T_B_E))
 
-    def _tf(self, lookup: TfLookup) -> None:
-        found = lookup.newest()
-        if found is not None and found[0] != self._tf_ns:
-            self._tf_ns = found[0]
-            self._stream.put(PoseSample(*found))
+    def _tf(self, stamp_ns: int, T_B_E: FloatArray | None) -> None:
+        if T_B_E is None:
+            self._stream.faults["/tf"] += 1
+        else:
+            self._stream.put(PoseSample(stamp_ns, T_B_E))
 
     def _phase(self, message: Any) -> None:
         self._stream.put(PhaseSample(self._now_ns(), phase_from(message)))
