@@ -63,11 +63,11 @@ def test_pushed_in_is_what_a_lift_is_not(slope: float) -> None:
 
 
 def slip_told(held: list[bool], pushed_m: float) -> list[bool]:
-    """A kick of 1.1 mm into a pattern 40 µm away at frame 20: weak signs, which need the third."""
+    """A kick of 1 mm into a pattern 40 µm away at frame 20: weak signs, which need the third."""
     detector = SlipDetector(SlipLimits())
     told = []
     for k, h in enumerate(held):
-        D = np.array([0.0, 1.1e-3 * (k >= 20), 0.0])
+        D = np.array([0.0, 1.0e-3 * (k >= 20), 0.0])
         residual = np.zeros((4, 3))
         residual[:, 1] = 4.4e-5 * (k >= 20)
         told.append(detector.update(D, residual, pushed_m, REFERENCE.normal_E, REFERENCE.slip, h))

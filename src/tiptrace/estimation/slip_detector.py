@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from tiptrace.estimation.kernels import pattern_change
+from tiptrace.estimation.pattern_kernels import pattern_change
 from tiptrace.types import FloatArray
 
 BEFORE, AFTER = 10, 4  # frames compared
@@ -65,7 +65,7 @@ class SlipLimits(BaseModel):
     pattern_alone_m: float = Field(default=8.0e-4, gt=0)  # the same, without a kick
     pushed_m: float = Field(default=5.0e-4, gt=0)  # of the tip into the surface, as it seems
     margin: float = Field(default=1.3, ge=1)  # over what Stage I showed
-    evidence: float = Field(default=1.25, gt=0)  # product of the three signs
+    evidence: float = Field(default=0.6, gt=0)  # product of the three signs
 
 
 class SlipDetector:
