@@ -13,11 +13,14 @@ import argparse
 import tempfile
 from pathlib import Path
 
-from tiptrace.calibration.gel import train_gel
+import numpy as np
+
+from tiptrace.calibration.gel_family import train_family
 from tiptrace.sim.presses import PressPlan, write_press_folder
 
-GEL_SEEDS = (9001, 9002, 9003, 9004, 9005, 9006)
-"""Set aside for this: trials draw their gels from 31-bit seeds."""
+GEL_SEEDS = tuple(range(9001, 9050))
+"""Set aside for this: trials draw their gels from 31-bit seeds. Gels take turns; 49 of them, so that with 48 presses
+a round each gel is pressed everywhere in time."""
 
 
 def main() -> None:
@@ -30,7 +33,7 @@ def main() -> None:
         "--keep", type=Path, help="where to leave the presses; by default they are thrown away"
     )
     parser.add_argument(
-        "--rounds", type=int, default=4, help="how often the whole gel is covered (48 presses)"
+        "--rounds", type=int, default=24, help="how often the whole gel is covered (48 presses)"
     )
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
@@ -38,12 +41,15 @@ def main() -> None:
         folder = args.keep or Path(scratch)
         write_press_folder(folder, PressPlan(gel_seeds=GEL_SEEDS, rounds=args.rounds, seed=args.seed))
         args.out.parent.mkdir(parents=True, exist_ok=True)
-        report = train_gel(folder, args.out, seed=args.seed, mm_per_px=(0.0625, 0.0625))
+        report = train_family(folder, args.out, len(GEL_SEEDS), mm_per_px=(0.0625, 0.0625), seed=args.seed)
+    normal = np.median([s.normal_error_deg for s in report.held_out])
+    depth = np.sqrt(np.mean([s.depth_rms_m**2 for s in report.held_out]))
+    radius = np.median([abs(s.radius_error) for s in report.held_out])
     print(
-        f"{report.model}: {len(report.trained_on)} presses, {len(report.held_out)} held out, "
+        f"{args.out}: {report.gels} gels, {report.trained_on} presses, {len(report.held_out)} held out, "
         f"{report.seconds:.0f} s\n"
-        f"normal error {report.normal_error_deg:.2f}°, depth rms {report.depth_rms_m * 1e6:.0f} µm, ball radius "
-        f"{100 * report.radius_error:.1f} % off, steepest slope seen {report.max_slope:.2f}"
+        f"normal error {normal:.2f}°, depth rms {depth * 1e6:.0f} µm, ball radius "
+        f"{100 * radius:.1f} % off, steepest slope seen {report.max_slope:.2f}"
     )
 
 

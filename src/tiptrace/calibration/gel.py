@@ -112,8 +112,8 @@ def train_gel(
     shading = shading_of(training, found, one_place=one_place)
     held_out = [locate(data.presses[i], data, shading) for i in test]
     convention = Convention(background="ratio", coordinates="zero" if one_place else "unit")
-    network = train_network(shading, data.background, pixel_noise(data), convention, rng, tell)
-    valid = _coverage(found)
+    network = train_network([shading], data.background, pixel_noise(data), convention, rng, tell)
+    valid = coverage(found)
     metadata = _metadata(data, valid, shading) | {"one_place": "yes" if one_place else "no"}
     out.write_bytes(mlp_to_onnx(network.weights, network.biases, convention, metadata=metadata))
     gel = GelModel(out.read_bytes(), str(out))
@@ -170,7 +170,7 @@ def pixel_noise(data: PressFolder) -> FloatArray:
     return np.asarray(0.5 * 1.4826 * np.median(np.abs(residual), axis=(0, 1)) + 0.2)
 
 
-def _coverage(circles: list[Circle]) -> tuple[float, float, float, float]:
+def coverage(circles: list[Circle]) -> tuple[float, float, float, float]:
     """Rectangle (u_min, v_min, u_max, v_max) that the contacts cover, px."""
     c = np.array([(c.u, c.v, c.radius) for c in circles])
     low, high = np.min(c[:, :2] - c[:, 2:], axis=0), np.max(c[:, :2] + c[:, 2:], axis=0)

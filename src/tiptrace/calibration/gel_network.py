@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,22 +34,25 @@ class Network:
 
 
 def train_network(
-    shading: Shading,
+    shadings: Sequence[Shading],
     background: NDArray[np.float32],
     noise_bgr: FloatArray,
     convention: Convention,
     rng: np.random.Generator,
     progress: Progress | None = None,
+    *,
+    steepest: float | None = None,
 ) -> Network:
     """Teach the inverse: colour ratio and place in, unit normal out.
 
     Args:
-        shading: What to invert.
+        shadings: What to invert; samples come evenly from several gels.
         background: (H, W, 3) grey levels of the untouched gel.
         noise_bgr: (3,) standard deviation of the camera's noise, grey levels.
         convention: How the network will be fed.
         rng: Decides samples and initial weights.
         progress: Called with a label and the share done.
+        steepest: Slope up to which is taught; None: what the presses showed and a little more.
 
     Raises:
         MissingExtraError: scikit-learn is not installed.
@@ -59,7 +62,9 @@ def train_network(
         from sklearn.neural_network import MLPRegressor
     except ImportError:
         raise MissingExtraError("scikit-learn", "calibrate") from None
-    X, Y = _samples(shading, background, noise_bgr, convention, rng)
+    if steepest is None:
+        steepest = min(_BEYOND * max(s.max_slope for s in shadings), _STEEPEST)
+    X, Y = _samples(shadings, steepest, background, noise_bgr, convention, rng)
     mean, scale = X.mean(axis=0), X.std(axis=0) + 1e-6
     X = ((X - mean) / scale).astype(np.float32)
     model = MLPRegressor(
@@ -91,7 +96,8 @@ def train_network(
 
 
 def _samples(
-    shading: Shading,
+    shadings: Sequence[Shading],
+    steepest: float,
     background: NDArray[np.float32],
     noise_bgr: FloatArray,
     convention: Convention,
@@ -101,14 +107,16 @@ def _samples(
     H, W = background.shape[:2]
     v, u = rng.integers(0, H, _SAMPLES), rng.integers(0, W, _SAMPLES)
     unit_uv = np.stack([u / W, v / H], axis=1)
-    slope = min(_BEYOND * shading.max_slope, _STEEPEST) * rng.uniform(0.0, 1.0, _SAMPLES)
+    slope = steepest * rng.uniform(0.0, 1.0, _SAMPLES)
     slope[rng.uniform(size=_SAMPLES) < _FLAT_SHARE] = 0.0
     direction = rng.uniform(0.0, 2.0 * np.pi, _SAMPLES)
     slopes = slope[:, None] * np.stack([np.cos(direction), np.sin(direction)], axis=1)
     B = background[v, u].astype(np.float64)
-    colours = B * (1.0 + shading.ratio_change(slopes, unit_uv)) + noise_bgr * rng.standard_normal(
-        (_SAMPLES, 3)
-    )
+    change = np.empty((_SAMPLES, 3))
+    for g, shading in enumerate(shadings):
+        own = slice(g, None, len(shadings))
+        change[own] = shading.ratio_change(slopes[own], unit_uv[own])
+    colours = B * (1.0 + change) + noise_bgr * rng.standard_normal((_SAMPLES, 3))
     colours = np.clip(colours, 0.0, 255.0)
     place = unit_uv if convention.coordinates == "unit" else np.zeros_like(unit_uv)
     X = np.concatenate([colours / np.maximum(B, 1.0) - 1.0, place], axis=1)

@@ -62,19 +62,36 @@ def fit_shading(
         background: (n, 3) grey levels of the untouched gel at the same pixels.
         place_degree: Highest power of the place; 0 where all presses are in one place.
     """
-    basis = _basis(slopes, unit_uv, place_degree)  # (n, k)
-    coefficients = np.empty((basis.shape[1], 3))
-    sigma = np.empty(3)
-    for c in range(3):
-        A = basis * background[:, c : c + 1]
-        y = colours[:, c] - background[:, c]
-        scale = A.std(axis=0) + 1e-9
-        A /= scale
-        x = np.linalg.solve(A.T @ A + _RIDGE * len(A) * np.eye(A.shape[1]), A.T @ y)
-        sigma[c] = np.sqrt(np.mean((A @ x - y) ** 2))
-        coefficients[:, c] = x / scale
+    flat = Shading(np.zeros(()), place_degree, np.zeros(3), 0.0)
+    coefficients, sigma = _ridge(flat, slopes, unit_uv, colours, background)
     steepest = float(np.percentile(np.hypot(slopes[:, 0], slopes[:, 1]), 99.5))
     return Shading(coefficients, place_degree, sigma, steepest)
+
+
+def fit_change(
+    known: Shading, slopes: FloatArray, unit_uv: FloatArray, colours: FloatArray, background: FloatArray
+) -> FloatArray:
+    """Coefficients (k, 3) to add to a known shading for another gel, small where presses say nothing."""
+    return _ridge(known, slopes, unit_uv, colours, background)[0]
+
+
+def _ridge(
+    known: Shading, slopes: FloatArray, unit_uv: FloatArray, colours: FloatArray, background: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Coefficients (k, 3) beyond what is known, and the residual's rms (3,)."""
+    basis = _basis(slopes, unit_uv, known.place_degree)  # (n, k)
+    k = basis.shape[1]
+    expected = basis @ np.broadcast_to(known.coefficients, (k, 3))  # (n, 3)
+    coefficients, sigma = np.empty((k, 3)), np.empty(3)
+    for c in range(3):
+        A = basis * background[:, c : c + 1]
+        y = colours[:, c] - background[:, c] * (1.0 + expected[:, c])
+        scale = A.std(axis=0) + 1e-9
+        A /= scale
+        x = np.linalg.solve(A.T @ A + _RIDGE * len(A) * np.eye(k), A.T @ y)
+        sigma[c] = np.sqrt(np.mean((A @ x - y) ** 2))
+        coefficients[:, c] = x / scale
+    return coefficients, sigma
 
 
 def _basis(slopes: FloatArray, unit_uv: FloatArray, place_degree: int) -> FloatArray:

@@ -33,7 +33,7 @@ _CALM_AROUND_PX = 8.0  # on the mean over so many pixels each way
 _FIRST_ROUNDS = 6
 _LEANS = 0.06  # slope below which gel, pressed in or not, may tell about a gain common to the lamps
 _NOISE_M = 12e-6  # of a marker's depth, wherever it lies
-_DEPTH_SHARE = 0.03  # of the depth: what a network errs by in scale on another gel of the same make
+_DEPTH_SHARE = 0.04  # of the depth: what a network errs by in scale on another gel of the same make
 _FILL_SHARE = 0.3  # of the slope's variation around a dot times its radius: error of the fill under it
 
 
