@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tiptrace.config import Tool
-from tiptrace.estimation import kernels
+from tiptrace.estimation import kernels, pattern_kernels
 from tiptrace.estimation.anchor import TipPrior
 from tiptrace.estimation.full import FullConfig, FullEstimator
 from tiptrace.estimation.pads import PadMarkers
@@ -322,7 +322,8 @@ def test_a_trial_compiles_nothing_on_the_way() -> None:
     estimator = FullEstimator(rig=rig())
 
     def kinds() -> int:
-        functions = [f for f in vars(kernels).values() if hasattr(f, "nopython_signatures")]
+        found = [*vars(kernels).values(), *vars(pattern_kernels).values()]
+        functions = [f for f in found if hasattr(f, "nopython_signatures")]
         return sum(len(f.nopython_signatures) for f in functions)
 
     before = kinds()

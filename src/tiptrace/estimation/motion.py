@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from tiptrace.estimation.kernels import fit_frames, residuals_in_plane, turn_of
+from tiptrace.estimation.kernels import fit_frames, residuals_in_plane
+from tiptrace.estimation.pattern_kernels import turn_of
 from tiptrace.geometry.transforms import skew
 from tiptrace.types import FloatArray
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from tiptrace.estimation.anchor import TipPrior
 from tiptrace.estimation.motion import Motions
-from tiptrace.estimation.tip_map_solver import (
+from tiptrace.estimation.tip_map_config import (
     DIAGONAL,
     DRIFT,
     G_,
@@ -22,13 +22,11 @@ from tiptrace.estimation.tip_map_solver import (
     SIZE,
     TAU,
     C,
-    HandAt,
     P,
-    Solution,
-    Solver,
     TipMapConfig,
     map_prior,
 )
+from tiptrace.estimation.tip_map_solver import HandAt, Solution, Solver
 from tiptrace.types import AnchorChecks, BoolArray, FloatArray
 
 __all__ = ["DRIFT", "G_", "TAU", "C", "P", "TipMap", "TipMapConfig", "assumed_tip_map", "solve_tip_map"]

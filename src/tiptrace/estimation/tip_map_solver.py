@@ -9,54 +9,30 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
 
 from tiptrace.estimation.anchor import TipPrior, fixed_point_ml
 from tiptrace.estimation.information import residual_noise, scaled_inverse
 from tiptrace.estimation.motion import Motions
 from tiptrace.estimation.pose_track import HandStates
 from tiptrace.estimation.robust import scale_from_median, tukey_weight
+from tiptrace.estimation.tip_map_config import (
+    DRIFT,
+    G_,
+    I9,
+    SIZE,
+    TAU,
+    C,
+    P,
+    TipMapConfig,
+    map_prior,
+)
 from tiptrace.geometry.transforms import rotation_exp, skew
 from tiptrace.types import AnchorChecks, BoolArray, FloatArray, IntArray
 
-C, P, G_, TAU, DRIFT = slice(0, 3), slice(3, 6), slice(6, 15), slice(15, 16), slice(16, 19)
-SIZE = 19
-I9 = np.eye(3).ravel()
-DIAGONAL = I9 > 0
 _MAP_CHANGE = 0.02  # of the map after a slip
 
 HandAt = Callable[[float], HandStates]
 """Latency in s → the hand at every frame's exposure."""
-
-
-class TipMapConfig(BaseModel):
-    """Priors and gates."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    learn_map: bool = True
-    map_sigma: float = Field(default=0.10, gt=0)
-    map_off_diagonal_sigma: float = Field(default=0.06, gt=0)
-    map_shear_correlation: float = Field(default=0.8, ge=0, lt=1)  # of the two axes along the pads
-    map_gate_m: float = Field(default=1e-3, gt=0)  # standard deviation of the enforced motion along an axis
-    latency_s: float = 0.050  # where the rig says nothing
-    latency_std_s: float = Field(default=0.030, gt=0)
-    latency_gate_s: float = Field(default=0.010, gt=0)
-    drift_sigma_m: float = Field(default=3e-3, gt=0)  # along the pads
-    drift_normal_sigma_m: float = Field(default=1e-4, gt=0)  # across them, where the tool cannot slip
-    step_normal_sigma_m: float = Field(
-        default=3e-4, gt=0
-    )  # of a slip across the pads: depth is another afterwards
-    hidden_drift: float = Field(default=0.3, ge=0)  # share of its σ that a drift without evidence still has
-    slip_again: float = Field(default=0.5, ge=0)  # of the slips in Stage I, per its length, in Stage II
-    drift_evidence: float = Field(default=3.0, gt=0)  # sigmas
-    pose_sigma_m: float = Field(default=4e-5, gt=0)  # of the tip through the smoothed hand pose
-    model_sigma_m: float = Field(default=1e-4, gt=0)  # what a linear map leaves, per frame
-    common_sigma_m: float = Field(default=8e-5, ge=0)  # and what it leaves in all frames alike, per axis
-    # frames' variance is measured in Stage I, but slow errors do not show there: never below this share of the assumed
-    least_noise: float = Field(default=0.25, gt=0)
-    outlier: float = Field(default=6.0, gt=0)  # whitened residual of a frame in which the tip did not rest
-    iterations: int = Field(default=15, ge=3)
 
 
 @dataclass(frozen=True, slots=True)
@@ -241,10 +217,21 @@ class Solver:
         rested = weights > 0.1
         variance, correlation = residual_noise(r[rested], S_inv[rested])
         noise = max(variance, self._config.least_noise)
-        factor = noise * correlation
-        N = np.einsum("tij,tik->jk", A, weights[:, None, None] * (S_inv @ A), optimize=True) / factor
-        N[C, C] -= self._spurious(S_inv, weights) / factor
-        N += self._prior_N
+        correlated = max(1.0, variance * correlation)
+        N = np.einsum("tij,tik->jk", A, weights[:, None, None] * (S_inv @ A), optimize=True)
+        N[C, C] -= self._spurious(S_inv, weights)
+        covariance = self._covariance(N / (noise * correlation), free)
+        cautious = self._covariance(N / max(correlated, noise * correlation), free)
+        for part in (TAU, DRIFT):  # gels lag, and creep is no straight line: no less than assumed
+            covariance[part, part] = cautious[part, part]
+        for part in (C, P):
+            covariance[part, part] += self._config.common_sigma_m**2 * np.eye(3)
+        rms = float(np.sqrt(np.average(np.sum(r * r, axis=1), weights=np.maximum(weights, 1e-9))))
+        return Solution(theta, covariance, free, rms, correlated, noise, r, delta, weights)
+
+    def _covariance(self, N: FloatArray, free: BoolArray) -> FloatArray:
+        """From what the frames say (19, 19); unknowns that a gate holds keep their prior and are considered."""
+        N = N + self._prior_N
         f, h = np.flatnonzero(free), np.flatnonzero(~free)
         h = h[(h >= 6) & (h < 16)]  # a drift that no evidence speaks for is not considered
         P_ff = scaled_inverse(N[np.ix_(f, f)])
@@ -257,13 +244,7 @@ class Solver:
             covariance[np.ix_(f, h)] = K @ P_h
             covariance[np.ix_(h, f)] = P_h @ K.T
             covariance[np.ix_(h, h)] = P_h
-        rms = float(np.sqrt(np.average(np.sum(r * r, axis=1), weights=np.maximum(weights, 1e-9))))
-        for part in (C, P):
-            covariance[part, part] += self._config.common_sigma_m**2 * np.eye(3)
-        correlated = max(1.0, variance * correlation)
-        for part in (TAU, DRIFT):  # gels lag and creep is no straight line: no less than assumed
-            covariance[part, part] *= max(1.0, correlated / factor)
-        return Solution(theta, covariance, free, rms, correlated, noise, r, delta, weights)
+        return covariance
 
     def checks(self, best: Solution) -> AnchorChecks:
         """Stage I against itself: its halves, frames predicted from the others, and the prior (one step each)."""
@@ -324,13 +305,3 @@ class Solver:
         K = skew(np.eye(3))
         E = np.einsum("tmn,mki,tkl,nlj->tij", self._m.covariance[:, :3, :3], K, S_inv, K, optimize=True)
         return np.asarray(np.einsum("t,tki,tkl,tlj->ij", weights, self._m.R, E, self._m.R, optimize=True))
-
-
-def map_prior(config: TipMapConfig, normal: FloatArray) -> FloatArray:
-    """Covariance (9, 9) of G, row-major: what the gel shows along the two axes in the pads' plane is alike."""
-    basis = np.linalg.svd(normal[None])[2]  # rows: normal, two axes along the pads
-    sigma = np.where(np.eye(3) > 0, config.map_sigma, config.map_off_diagonal_sigma).ravel()
-    P = np.diag(sigma**2)
-    P[4, 8] = P[8, 4] = config.map_shear_correlation * config.map_sigma**2
-    turn = np.kron(basis.T, basis.T)  # G_E = basisᵀ G_pad basis
-    return np.asarray(turn @ P @ turn.T)

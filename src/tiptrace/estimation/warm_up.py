@@ -6,8 +6,8 @@ import functools
 
 import numpy as np
 
-from tiptrace.estimation.kernels import pattern_change
 from tiptrace.estimation.motion import MotionConfig, TemplateFit
+from tiptrace.estimation.pattern_kernels import pattern_change
 from tiptrace.estimation.pose_track import PoseTrack
 from tiptrace.types import PoseSample
 
