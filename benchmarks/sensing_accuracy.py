@@ -57,11 +57,12 @@ def grasp(t: float, seed: int) -> GelDeformation:
 
 @dataclass(frozen=True)
 class Errors:
-    """Per frame and marker inside the patch: (f, n, 2) px, (f, n) m and their sigma, (f, 2) tilt."""
+    """Per frame and marker inside the patch: (f, n, 2) px, (f, n) m, their sigma and true depth, (f, 2) tilt."""
 
     in_plane_px: np.ndarray
     depth_m: np.ndarray
     sigma_m: np.ndarray
+    true_m: np.ndarray
     tilt: np.ndarray
 
 
@@ -93,7 +94,13 @@ def measure(
     error = (np.array(depth) - np.array(depth_true))[:, always]
     places = np.array(uv_true)[:, always]
     tilt = np.array([tilt_of(e, p) for e, p in zip(error, places, strict=True)])
-    return Errors((np.array(uv)[:, always] - places), error, np.array(sigma)[:, always], tilt)
+    return Errors(
+        (np.array(uv)[:, always] - places),
+        error,
+        np.array(sigma)[:, always],
+        np.array(depth_true)[:, always],
+        tilt,
+    )
 
 
 def in_patch(slopes: tuple[np.ndarray, np.ndarray], z: np.ndarray, uv: np.ndarray) -> np.ndarray:
@@ -128,6 +135,24 @@ def row(label: str, runs: list[Errors]) -> None:
     )
 
 
+def by_gel(model: GelModel, seeds: range, frames: int, gels: list[int]) -> None:
+    """Where the absolute error comes from: each gel and press, depth error = scale × true depth + rest."""
+    print(
+        f"\n{'gel':>4} {'press':>6} {'depth mm':>9} {'abs µm':>7} {'scale %':>8} {'rest µm':>8} {'Δ µm':>6}"
+    )
+    for gel in gels:
+        for s in seeds:
+            e = measure(model, gel_optics(gel), None, s, frames, SensingConfig())
+            seen = np.isfinite(e.depth_m)
+            scale = float(np.sum(e.depth_m[seen] * e.true_m[seen]) / np.sum(e.true_m[seen] ** 2))
+            rest, change = e.depth_m - scale * e.true_m, (e.depth_m - e.depth_m[0])[1:]
+            print(
+                f"{gel:>4} {s:>6} {1e3 * e.true_m.mean():>9.2f} {1e6 * rms(e.depth_m):>7.0f} {100 * scale:>+8.1f} "
+                f"{1e6 * rms(rest):>8.0f} {1e6 * rms(change):>6.0f}",
+                flush=True,
+            )
+
+
 def drift(gel: GelModel, minutes: float, every: int = 25) -> None:
     """A static gel under slowly brightening lamps: how far the markers seem to go."""
     noise = CameraNoise(flicker=0.002, drift_per_minute=0.01)
@@ -160,9 +185,13 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=20)
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--drift-minutes", type=float, default=5.0)
+    parser.add_argument("--by-gel", type=int, nargs="*", help="only these gels, one line for each press")
     args = parser.parse_args()
     gel, full = load_gel_model(args.gel), SensingConfig()
     seeds = range(1, 1 + args.seeds)
+    if args.by_gel:
+        by_gel(gel, seeds, args.frames, args.by_gel)
+        return
 
     def runs(
         model: GelModel | None, optics: list[Optics], config: SensingConfig, noise: CameraNoise | None = None
