@@ -75,4 +75,4 @@ def test_poses_from_tf(tmp_path: Path) -> None:
 def test_silence_or_a_missing_part_is_one_sentence(uri: str, tmp_path: Path) -> None:
     found = listen(uri, tmp_path / "found.json", None)
     missing = uri == "ros2:tf" and not has("tf2_msgs")
-    assert ("tf2_msgs is not in this Python" if missing else "no pose within 5 s") in found["error"]
+    assert ("tf2_msgs.msg is not in this Python" if missing else "no pose within 5 s") in found["error"]

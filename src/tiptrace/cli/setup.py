@@ -35,12 +35,13 @@ def setup(
     from tiptrace.config import Rig, load_yaml
     from tiptrace.drivers.opening import open_robot
     from tiptrace.drivers.timeline import Timeline
-    from tiptrace.live.setup import Setup, candidates
+    from tiptrace.live.setup import Setup, candidates, refuse_an_old_rig
     from tiptrace.streams.live import check_frames
     from tiptrace.types import SIDES
 
     console = Console()
     rig = load_yaml(Rig, start_from)
+    refuse_an_old_rig(out)
     if robot is not None:
         device = open_robot(robot, Timeline())
         check_frames(device.frames, rig.frames)

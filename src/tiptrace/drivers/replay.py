@@ -99,7 +99,7 @@ def _from_mcap(path: Path) -> tuple[list[PoseSample], str | None]:
                 poses.append(_pose(stamp_ns, (p.x, p.y, p.z), [o.x, o.y, o.z, o.w]))
     except (OSError, McapError, ValueError, AttributeError, GeometryError) as error:
         raise DeviceError(
-            f"{path}: its poses cannot be read ({getattr(error, 'strerror', None) or error})"
+            f"{path}: its poses cannot be read ({getattr(error, 'strerror', None) or str(error) or 'no MCAP file'})"
         ) from None
     if not poses:
         raise DeviceError(f"{path}: has no poses on /ee_pose")

@@ -189,6 +189,17 @@ class Setup:
         return path
 
 
+def refuse_an_old_rig(folder: Path) -> None:
+    """There must be no rig file in the folder yet; told before anybody touches a gel.
+
+    Raises:
+        OutputError: there is.
+    """
+    path = folder / RIG_FILE
+    if path.exists():
+        raise OutputError(f"{path}: exists already; give another folder with --out")
+
+
 def _size_px(raw: RawFrame) -> tuple[int, int]:
     """Width and height of what a camera sends.
 

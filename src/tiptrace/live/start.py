@@ -18,6 +18,7 @@ from tiptrace.perception.gel_model import load_gel_model
 from tiptrace.streams.live import LiveStream
 from tiptrace.streams.recording import check_reference, decode_reference
 from tiptrace.streams.topics import REFERENCE_FILE, TOOL_FILE
+from tiptrace.tracer import METHODS
 from tiptrace.types import SIDES, Image, Side
 
 
@@ -102,6 +103,8 @@ def make_session(
     Raises:
         TipTraceError: an address that means nothing, or a device that is not there.
     """
+    if method not in METHODS:
+        raise ConfigError(f"unknown method {method!r}; valid: {', '.join(METHODS)}")
     timeline, rig = Timeline(), folder.rig
     cameras = {
         side: open_camera(addresses[side], rig.sensor(side), timeline, encode=out is not None)

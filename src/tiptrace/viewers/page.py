@@ -80,7 +80,8 @@ class PageServer:
         except OSError as error:
             self._socket.close()
             raise OutputError(
-                f"page: cannot listen on {self.host}:{self._port} ({error.strerror}); give another --port"
+                f"page: cannot listen on {self.host}:{self._port} ({error.strerror}); "
+                "give another address, such as --serve 127.0.0.1:8322"
             ) from None
         self._port = int(self._socket.getsockname()[1])
         config = uvicorn.Config(
