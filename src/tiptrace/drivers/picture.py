@@ -17,6 +17,7 @@ from tiptrace.types import Image
 
 JPEG_QUALITY = 95
 _FLIP = {"horizontal": 1, "vertical": 0, "both": -1}
+_MOST_PX = 32_000_000
 _BLOCKS = (16, 12)  # of which the picture's means are compared, x and y
 _BLOCK_STEP, _MANY_BLOCKS = (
     40.0,
@@ -52,9 +53,12 @@ def inspect_jpeg(data: bytes) -> ScanFacts:
     if end[-2:] != b"\xff\xd9":
         raise PictureError("is cut off")
     try:
-        return walk(end)
+        facts = walk(end)
     except ScanError as error:
         raise PictureError(str(error)) from None
+    if facts.size_px is not None and facts.size_px[0] * facts.size_px[1] > _MOST_PX:
+        raise PictureError(f"claims {facts.size_px[0]}x{facts.size_px[1]} px")
+    return facts
 
 
 def decode_jpeg(data: bytes, reduction: int = 1) -> Image:
