@@ -16,15 +16,13 @@ from tiptrace.evaluation.records import TrialRecord
 from tiptrace.evaluation.statistics import summarise
 from tiptrace.evaluation.suite_store import SuiteStore
 from tiptrace.evaluation.suite_tables import (
-    aligned,
     analytic_table,
     correlation_table,
     coverage_table,
-    methods_of,
     sets_table,
-    values_by_trial,
     wins_table,
 )
+from tiptrace.evaluation.suite_values import aligned, methods_of, values_by_trial
 from tiptrace.evaluation.tables import MISSING, Cell, Table, columns, mean_std, rows_of
 
 BEGIN, END = "<!-- suite:begin -->", "<!-- suite:end -->"

@@ -17,7 +17,7 @@ from tiptrace.evaluation.analytic import CENTRELINES, analytic_truth
 from tiptrace.evaluation.conditions import Condition
 from tiptrace.evaluation.error_series import initial_point
 from tiptrace.evaluation.runner import TrialRun, TrialTask
-from tiptrace.evaluation.suite_tables import BASELINES
+from tiptrace.evaluation.suite_values import BASELINES
 from tiptrace.evaluation.truth import Truth
 from tiptrace.evaluation.truth_files import read_truth
 from tiptrace.pipeline import Step, replay, trace

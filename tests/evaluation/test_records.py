@@ -70,3 +70,6 @@ def test_events_match_when_they_overlap_within_the_tolerance():
     strict = score_events(detected, true, "grasp-slip", tolerance_s=0.1)
     assert (strict.hits, strict.misses, strict.false_alarms) == (1, 1, 2)
     assert score_events([], true, "grasp-slip").misses == 2
+    slight = [Event("grasp-slip", 40 * S, 41 * S, "")]
+    assert score_events(detected, true, "grasp-slip", slight=slight).false_alarms == 0
+    assert score_events([], true, "grasp-slip", slight=slight).misses == 2

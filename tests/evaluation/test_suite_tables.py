@@ -12,17 +12,15 @@ import numpy as np
 import pytest
 
 from tiptrace.evaluation.conditions import CONDITION_SETS, Condition, distinct_conditions, sets_of
+from tiptrace.evaluation.suite_side_tables import events_table, failures_table
 from tiptrace.evaluation.suite_tables import (
     correlation_table,
-    events_table,
-    failures_table,
-    outliers,
     overall_table,
-    set_values,
     sets_table,
     suite_tables,
     wins_table,
 )
+from tiptrace.evaluation.suite_values import outliers, set_values
 from tiptrace.evaluation.tables import Table, columns, write_tables
 
 from .suite_builders import suite
@@ -77,7 +75,7 @@ def test_wins_are_counted_over_trials_that_both_finished():
     row = rows["full", "ee-only", "trajectory RMSE [mm]"]
     assert (row["n"], row["wins"], row["losses"]) == (48, 48, 0)
     assert row["p_value"] == "< 0.001"
-    assert rows["full", "paper", "shape RMSE [mm]"]["n"] == 47
+    assert rows["full", "paper", "shape RMSE [mm]"]["n"] == "47 of 48"
     assert ("ee-only", "paper", "shape RMSE [mm]") not in rows
 
 
@@ -88,8 +86,11 @@ def test_failures_are_listed_by_name_and_reason():
 
 
 def test_events_are_added_up_over_trials():
-    records = [replace(r, events={"grasp-slip": (1, 2, 3)}) for r in suite(repeats=1) if r.method == "full"]
-    assert events_table(records).rows == (("full", "grasp-slip", 12, 24, 36),)
+    own = [r for r in suite(repeats=1) if r.method == "full"]
+    records = [replace(r, events={"grasp-slip": (1, 2, 3)}) for r in own]
+    assert events_table(records).rows == (("full", "grasp-slip", 12, 24, 36, "–"),)
+    late = [replace(r, event_delays_s={"grasp-slip": (0.25 + 0.5 * (k % 2),)}) for k, r in enumerate(records)]
+    assert events_table(late).rows == (("full", "grasp-slip", 12, 24, 36, "0.50"),)
 
 
 def test_outliers_are_far_above_the_rest():

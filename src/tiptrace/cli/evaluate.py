@@ -78,7 +78,7 @@ def evaluate(
 
     from tiptrace.errors import ConfigError
     from tiptrace.evaluation.suite_store import SuiteStore
-    from tiptrace.evaluation.suite_tables import without_truth
+    from tiptrace.evaluation.suite_values import without_truth
     from tiptrace.evaluation.versions import library_versions
     from tiptrace.trial_plan import recording_tasks, suite_tasks
 
@@ -189,7 +189,7 @@ def _report_outliers(
     from tiptrace.cli.show import progress_bar
     from tiptrace.errors import TipTraceError
     from tiptrace.evaluation.suite_store import file_name
-    from tiptrace.evaluation.suite_tables import outliers
+    from tiptrace.evaluation.suite_values import outliers
     from tiptrace.trial_runs import report_trial
 
     worst = {r.trial for r in outliers(records, methods[0])[:_MOST_REPORTS]}
@@ -212,7 +212,7 @@ def _report(
     suite: str | None,
 ) -> Path:
     from tiptrace.evaluation.suite_report import SuiteData, write_suite_report
-    from tiptrace.evaluation.suite_tables import without_truth
+    from tiptrace.evaluation.suite_values import without_truth
     from tiptrace.evaluation.versions import library_versions
 
     store.finish(records)
@@ -236,7 +236,8 @@ def _show(console: Any, records: list[TrialRecord], page: Path) -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    from tiptrace.evaluation.suite_tables import failures_table, without_truth
+    from tiptrace.evaluation.suite_side_tables import failures_table
+    from tiptrace.evaluation.suite_values import without_truth
     from tiptrace.evaluation.terminal_table import terminal_table
 
     errors = terminal_table(records)

@@ -11,7 +11,7 @@ from tiptrace.evaluation import published, style
 from tiptrace.evaluation.conditions import CONDITION_SETS, VARIED, Condition, sets_of
 from tiptrace.evaluation.records import TrialRecord
 from tiptrace.evaluation.statistics import spearman, summarise
-from tiptrace.evaluation.suite_tables import (
+from tiptrace.evaluation.suite_values import (
     BASELINES,
     aligned,
     methods_of,

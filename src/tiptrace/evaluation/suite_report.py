@@ -15,7 +15,9 @@ from tiptrace.evaluation.conditions import Condition
 from tiptrace.evaluation.embedding import FIGURES, EmbeddedFigure, embed_figure, render
 from tiptrace.evaluation.records import TrialRecord
 from tiptrace.evaluation.style import FORMATS, figure_style
-from tiptrace.evaluation.suite_tables import BASELINES, budget_table, methods_of, outliers, suite_tables
+from tiptrace.evaluation.suite_side_tables import budget_table
+from tiptrace.evaluation.suite_tables import suite_tables
+from tiptrace.evaluation.suite_values import BASELINES, methods_of, outliers
 from tiptrace.evaluation.tables import write_tables
 from tiptrace.evaluation.traces import TrialTraces
 

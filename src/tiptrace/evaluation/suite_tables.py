@@ -2,31 +2,29 @@
 
 from __future__ import annotations
 
-import math
-from collections import defaultdict
-from collections.abc import Mapping, Sequence
-
-import numpy as np
+from collections.abc import Sequence
 
 from tiptrace.evaluation import published
 from tiptrace.evaluation.conditions import CONDITION_SETS, VARIED
 from tiptrace.evaluation.records import TrialRecord
 from tiptrace.evaluation.statistics import Summary, compare, spearman, summarise
+from tiptrace.evaluation.suite_side_tables import events_table, failures_table
+from tiptrace.evaluation.suite_values import (
+    BASELINES,
+    MAIN_METRICS,
+    MORE_METRICS,
+    NAMES,
+    aligned,
+    counted,
+    methods_of,
+    over_the_others,
+    set_trials,
+    set_values,
+    trials_of,
+    values_by_trial,
+    with_count,
+)
 from tiptrace.evaluation.tables import Cell, Table, columns, mean_std, rows_of, show_interval, show_p
-from tiptrace.types import FloatArray
-
-BASELINES = ("ee-only", "ee-oracle", "nominal-tip", "local-anchoring")
-MAIN_METRICS = ("trajectory_rmse_mm", "shape_rmse_mm", "initial_contact_error_mm")
-_MORE = ("cross_track_rmse_mm", "along_track_rmse_mm", "frechet_mm")
-_NAMES = {
-    "trajectory_rmse_mm": "trajectory RMSE [mm]",
-    "shape_rmse_mm": "shape RMSE [mm]",
-    "initial_contact_error_mm": "initial contact error [mm]",
-    "cross_track_rmse_mm": "cross-track RMSE [mm]",
-    "along_track_rmse_mm": "along-track RMSE [mm]",
-    "frechet_mm": "discrete Fréchet distance [mm]",
-    "loop_rate_hz": "loop rate [Hz]",
-}
 
 
 def suite_tables(records: Sequence[TrialRecord]) -> list[Table]:
@@ -45,28 +43,6 @@ def suite_tables(records: Sequence[TrialRecord]) -> list[Table]:
     return [t for t in tables if t.rows]
 
 
-def methods_of(records: Sequence[TrialRecord]) -> list[str]:
-    """Methods in the order of their first record."""
-    return list(dict.fromkeys(r.method for r in records))
-
-
-def metric_heading(metric: str) -> str:
-    """A metric's name with its unit, for headings and axes."""
-    return _NAMES[metric]
-
-
-def values_by_trial(records: Sequence[TrialRecord], method: str, metric: str) -> dict[str, float]:
-    """A metric of one method by trial; the last record of a trial counts. NaN where it failed."""
-    return {r.trial: r.value(metric) for r in records if r.method == method}
-
-
-def aligned(records: Sequence[TrialRecord], methods: Sequence[str], metric: str) -> list[FloatArray]:
-    """A metric of several methods over the trials that all of them were run on, in one order."""
-    by_method = [values_by_trial(records, m, metric) for m in methods]
-    trials = [t for t in by_method[0] if all(t in values for values in by_method)]
-    return [np.array([values[t] for t in trials]) for values in by_method]
-
-
 def overall_table(records: Sequence[TrialRecord]) -> Table:
     """Mean ± std over trials, as the paper's Table II, with its row beside ours."""
     names = (*MAIN_METRICS, "cross_track_rmse_mm", "along_track_rmse_mm", "loop_rate_hz")
@@ -81,19 +57,22 @@ def overall_table(records: Sequence[TrialRecord]) -> Table:
         rows.append([method, count, *(mean_std(s.mean, s.std) for s in summaries), span])
     paper = (published.PUBLISHED.get(name) for name in names)
     low, high = published.LOOP_RATE_RANGE_HZ
-    cells = ["–" if p is None else mean_std(p.mean, p.std) for p in paper]
-    rows.append([published.LABEL, published.TRIALS, *cells, f"{low} … {high}"])
+    paper_cells = ["–" if p is None else mean_std(p.mean, p.std) for p in paper]
+    rows.append([published.LABEL, published.TRIALS, *paper_cells, f"{low} … {high}"])
     return Table(
         "overall",
         "Mean ± std over trials",
         columns(
             ("method", "method"),
             ("trials", "trials"),
-            *((n, _NAMES[n]) for n in names),
+            *((n, NAMES[n]) for n in names),
             ("loop_rate_range_hz", "slowest … fastest trial [Hz]"),
         ),
         rows_of(rows) if methods_of(records) else (),
-        "The last row is what the paper reports for its hardware; it is no result of these trials.",
+        _sentences(
+            "The last row is what the paper reports for its hardware; it is no result of these trials.",
+            over_the_others(records),
+        ),
     )
 
 
@@ -101,20 +80,22 @@ def distribution_table(records: Sequence[TrialRecord]) -> Table:
     """Median, 95th percentile and extremes of each metric."""
     rows: list[list[Cell]] = []
     for method in methods_of(records):
-        for name in (*MAIN_METRICS, *_MORE):
+        trials = trials_of(records, method)
+        for name in (*MAIN_METRICS, *MORE_METRICS):
             s = summarise(list(values_by_trial(records, method, name).values()))
             if s.n:
-                rows.append([method, _NAMES[name], s.n, s.mean, s.std, s.median, s.p95, s.min, s.max])
+                rows.append(
+                    [method, NAMES[name], counted(s.n, trials), s.mean, s.std, s.median, s.p95, s.min, s.max]
+                )
     heads = (("method", "method"), ("metric", "metric"), ("n", "n"), ("mean", "mean"), ("std", "std"))
     more = (("median", "median"), ("p95", "95 %"), ("min", "min"), ("max", "max"))
-    return Table("distribution", "Distribution over trials", columns(*heads, *more), rows_of(rows))
-
-
-def set_values(records: Sequence[TrialRecord], method: str, set_name: str, metric: str) -> FloatArray:
-    """A metric over the trials of a condition set; a condition shared by sets counts in each."""
-    conditions = set(CONDITION_SETS[set_name])
-    last = {r.trial: r for r in records if r.method == method and r.condition in conditions}
-    return np.array([r.value(metric) for r in last.values()], dtype=np.float64)
+    return Table(
+        "distribution",
+        "Distribution over trials",
+        columns(*heads, *more),
+        rows_of(rows),
+        over_the_others(records),
+    )
 
 
 def sets_table(records: Sequence[TrialRecord]) -> Table:
@@ -124,8 +105,12 @@ def sets_table(records: Sequence[TrialRecord]) -> Table:
         per_set: list[Summary] = [
             summarise(set_values(records, method, s, "shape_rmse_mm")) for s in CONDITION_SETS
         ]
+        cells = [
+            with_count(s, set_trials(records, method, n))
+            for s, n in zip(per_set, CONDITION_SETS, strict=True)
+        ]
         if any(s.n for s in per_set):
-            rows.append([method, *(_with_count(s) for s in per_set)])
+            rows.append([method, *cells])
     low, high = published.SET_SHAPE_RANGE_MM
     if rows:
         rows.append([published.LABEL, *[f"{low} … {high}"] * len(CONDITION_SETS)])
@@ -134,7 +119,7 @@ def sets_table(records: Sequence[TrialRecord]) -> Table:
         "Shape RMSE by condition set [mm], mean ± std (trials)",
         columns(("method", "method"), *((f"set_{s}", f"set {s}: {VARIED[s]}") for s in CONDITION_SETS)),
         rows_of(rows),
-        "A condition that sets share counts in each of them.",
+        _sentences("A condition that sets share counts in each of them.", over_the_others(records)),
     )
 
 
@@ -148,8 +133,9 @@ def correlation_table(records: Sequence[TrialRecord]) -> Table:
             c = spearman([contact[t] for t in contact], [other[t] for t in contact])
             if c.n >= 4:
                 interval = show_interval(c.low, c.high)
+                n = counted(c.n, trials_of(records, method))
                 rows.append(
-                    [method, _NAMES[name], c.n, c.rho, interval, show_p(c.p_value), published.SPEARMAN[name]]
+                    [method, NAMES[name], n, c.rho, interval, show_p(c.p_value), published.SPEARMAN[name]]
                 )
     return Table(
         "correlation",
@@ -180,9 +166,10 @@ def wins_table(records: Sequence[TrialRecord]) -> Table:
                 ours, theirs = aligned(records, (method, rival), name)
                 c = compare(ours, theirs)
                 if c.n:
-                    counts = [c.n, c.wins, c.losses, c.median_difference]
+                    of = min(trials_of(records, method), trials_of(records, rival))
+                    counts: list[Cell] = [counted(c.n, of), c.wins, c.losses, c.median_difference]
                     doubt = [show_interval(c.low, c.high), show_p(c.p_value)]
-                    rows.append([method, rival, _NAMES[name], *counts, *doubt])
+                    rows.append([method, rival, NAMES[name], *counts, *doubt])
     return Table(
         "wins",
         "Trial by trial against each baseline",
@@ -209,7 +196,8 @@ def coverage_table(records: Sequence[TrialRecord]) -> Table:
         coverage = summarise(list(values_by_trial(records, method, "coverage_95").values()))
         nees = summarise(list(values_by_trial(records, method, "nees_median").values()))
         if coverage.n:
-            rows.append([method, coverage.n, 100 * coverage.mean, 100 * coverage.min, nees.median])
+            n = counted(coverage.n, trials_of(records, method))
+            rows.append([method, n, 100 * coverage.mean, 100 * coverage.min, nees.median])
     return Table(
         "coverage",
         "Coverage of the 95 % covariance region",
@@ -229,92 +217,16 @@ def analytic_table(records: Sequence[TrialRecord]) -> Table:
     for method in methods_of(records):
         found = [summarise(list(values_by_trial(records, method, f"analytic_{n}").values())) for n in names]
         if any(s.n for s in found):
-            rows.append([method, max(s.n for s in found), *(mean_std(s.mean, s.std) for s in found)])
+            n = counted(max(s.n for s in found), trials_of(records, method))
+            rows.append([method, n, *(mean_std(s.mean, s.std) for s in found)])
     return Table(
         "analytic",
         "Against the analytic centreline anchored at the measured start, mean ± std",
-        columns(("method", "method"), ("n", "trials"), *((f"analytic_{n}", _NAMES[n]) for n in names)),
+        columns(("method", "method"), ("n", "trials"), *((f"analytic_{n}", NAMES[n]) for n in names)),
         rows_of(rows),
         "The paper's ground truth: the tip is taken to advance with the end effector, so friction drag is error.",
     )
 
 
-def events_table(records: Sequence[TrialRecord]) -> Table:
-    """Events hit, missed and raised without cause."""
-    totals: dict[tuple[str, str], list[int]] = defaultdict(lambda: [0, 0, 0])
-    for record in records:
-        for kind, counts in (record.events or {}).items():
-            for k, count in enumerate(counts):
-                totals[record.method, kind][k] += count
-    heads = (
-        ("method", "method"),
-        ("kind", "event"),
-        ("hits", "hit"),
-        ("misses", "missed"),
-        ("false", "false alarms"),
-    )
-    return Table(
-        "events",
-        "Events",
-        columns(*heads),
-        rows_of([[*key, *counts] for key, counts in totals.items() if any(counts)]),
-    )
-
-
-def budget_table(budget: Mapping[str, Sequence[TrialRecord]]) -> Table:
-    """Errors with one disturbance at a time: where they enter, at the anchor or on the way."""
-    rows: list[list[Cell]] = []
-    for name, records in budget.items():
-        for method in methods_of(records):
-            found = [summarise(list(values_by_trial(records, method, m).values())) for m in MAIN_METRICS]
-            rows.append([name, method, found[0].n, *(mean_std(s.mean, s.std) for s in found)])
-    return Table(
-        "budget",
-        "Error budget: one disturbance at a time, mean ± std",
-        columns(
-            *(("disturbance", "disturbance"), ("method", "method"), ("n", "trials")),
-            *((m, _NAMES[m]) for m in MAIN_METRICS),
-        ),
-        rows_of(rows),
-    )
-
-
-def failures_table(records: Sequence[TrialRecord]) -> Table:
-    """What gave no result, by name and reason; methods that failed alike in a row of their own."""
-    alike: dict[tuple[str, str], list[str]] = defaultdict(list)
-    run: dict[str, int] = defaultdict(int)
-    for record in records:
-        run[record.trial] += 1
-        if record.failure:
-            alike[record.trial, record.failure].append(record.method)
-    rows = [
-        [trial, "all" if 1 < len(methods) == run[trial] else ", ".join(methods), reason]
-        for (trial, reason), methods in alike.items()
-    ]
-    heads = (("trial", "trial"), ("method", "method"), ("reason", "reason"))
-    return Table("failures", "Failures", columns(*heads), rows_of(rows))
-
-
-def without_truth(records: Sequence[TrialRecord]) -> list[str]:
-    """Trials that have results and nothing to hold them against, in order."""
-    measured = {r.trial: False for r in records if not r.failure}
-    for record in records:
-        if record.metrics is not None and record.metrics.evaluated_frames:
-            measured[record.trial] = True
-    return [trial for trial, known in measured.items() if not known]
-
-
-def outliers(
-    records: Sequence[TrialRecord], method: str, metric: str = "trajectory_rmse_mm"
-) -> list[TrialRecord]:
-    """Trials above the upper quartile by more than 1.5 interquartile ranges, worst first."""
-    found = [r for r in records if r.method == method and math.isfinite(r.value(metric))]
-    if len(found) < 4:
-        return []
-    low, high = np.percentile([r.value(metric) for r in found], [25, 75])
-    worst = [r for r in found if r.value(metric) > high + 1.5 * (high - low)]
-    return sorted(worst, key=lambda r: -r.value(metric))
-
-
-def _with_count(s: Summary) -> str:
-    return "–" if s.n == 0 else f"{mean_std(s.mean, s.std)} ({s.n})"
+def _sentences(*parts: str) -> str:
+    return " ".join(part for part in parts if part)

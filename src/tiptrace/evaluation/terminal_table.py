@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from tiptrace.evaluation import published
 from tiptrace.evaluation.records import TrialRecord
 from tiptrace.evaluation.statistics import summarise
-from tiptrace.evaluation.suite_tables import MAIN_METRICS, methods_of, values_by_trial
+from tiptrace.evaluation.suite_values import MAIN_METRICS, methods_of, values_by_trial
 from tiptrace.evaluation.tables import MISSING, Table, columns, rows_of
 
 TITLE = "Errors over trials [mm], mean ± std"
