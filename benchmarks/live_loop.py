@@ -25,8 +25,9 @@ from tests.live.servers import FPS, in_child, play_trial  # noqa: E402
 
 from tiptrace.live.session import LiveSession  # noqa: E402
 from tiptrace.live.summary import LiveSummary  # noqa: E402
+from tiptrace.snapshot import Snapshot  # noqa: E402
 from tiptrace.streams.recording import Recording  # noqa: E402
-from tiptrace.types import SIDES, Snapshot  # noqa: E402
+from tiptrace.types import SIDES  # noqa: E402
 
 
 class Watch:

@@ -30,8 +30,9 @@ from live_bench import LEAD_S, PORTS, Trial, begin_with_the_trial, make_session,
 from tests.live.servers import Fault, in_child, play_trial  # noqa: E402
 
 from tiptrace.live.session import LiveSession  # noqa: E402
+from tiptrace.snapshot import Snapshot  # noqa: E402
 from tiptrace.streams.recording import Recording  # noqa: E402
-from tiptrace.types import SIDES, BoolArray, FloatArray, ImageSample, Phase, Snapshot, Status  # noqa: E402
+from tiptrace.types import SIDES, BoolArray, FloatArray, ImageSample, Phase, Status  # noqa: E402
 
 CAMERA_FAULTS = ("stall", "disconnect", "freeze", "repeat", "drop", "truncate", "garbage", "clock")
 ROBOT_FAULTS = ("disconnect", "stall", "clock")

@@ -12,6 +12,7 @@ MAY_IMPORT = {
     "errors": set(),
     "compiled": set(),
     "config": {"types", "errors", "geometry"},
+    "snapshot": {"types"},
     "geometry": {"types", "errors"},
     "perception": BASE | {"compiled", "geometry", "models"},
     "estimation": BASE | {"compiled", "geometry"},
@@ -45,7 +46,17 @@ MAY_IMPORT = {
         "tracer",
     },
     "live": BASE
-    | {"geometry", "drivers", "streams", "perception", "estimation", "tracer", "pipeline", "calibration"},
+    | {
+        "snapshot",
+        "geometry",
+        "drivers",
+        "streams",
+        "perception",
+        "estimation",
+        "tracer",
+        "pipeline",
+        "calibration",
+    },
     "ros": BASE | {"drivers", "geometry", "live", "pipeline", "streams"},
     "trial_plan": BASE | {"evaluation", "sim", "trial_runs"},
     "reconstruction": BASE

@@ -16,7 +16,8 @@ from tiptrace.errors import ConfigError
 from tiptrace.estimation.anchor import TipPrior
 from tiptrace.estimation.baselines import EeOracleEstimator, LocalAnchoringEstimator, NominalTipEstimator
 from tiptrace.estimation.ee_only import EeOnlyEstimator, Estimator
-from tiptrace.estimation.full import FullConfig, FullEstimator
+from tiptrace.estimation.full import FullEstimator
+from tiptrace.estimation.full_config import FullConfig
 from tiptrace.estimation.paper import PaperEstimator
 from tiptrace.estimation.stage_one import Anchoring
 from tiptrace.perception.finger import Finger

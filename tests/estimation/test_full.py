@@ -10,7 +10,8 @@ import pytest
 from tiptrace.config import Tool
 from tiptrace.estimation import kernels, pattern_kernels
 from tiptrace.estimation.anchor import TipPrior
-from tiptrace.estimation.full import FullConfig, FullEstimator
+from tiptrace.estimation.full import FullEstimator
+from tiptrace.estimation.full_config import FullConfig
 from tiptrace.estimation.pads import PadMarkers
 from tiptrace.estimation.stage_one import StageOne
 from tiptrace.types import FingerMarkers, FloatArray, Phase, SensedFinger, SensedPair, Status, TipEstimate

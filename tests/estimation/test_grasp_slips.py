@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tiptrace.estimation.full import FullConfig, FullEstimator
+from tiptrace.estimation.full import FullEstimator
+from tiptrace.estimation.full_config import FullConfig
 from tiptrace.types import FingerMarkers, SensedFinger, SensedPair
 
 from .synthetic import Synthetic

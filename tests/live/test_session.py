@@ -28,19 +28,10 @@ from tiptrace.live.recorder import Recorder
 from tiptrace.live.session import LiveSession
 from tiptrace.live.summary import LiveSummary
 from tiptrace.pipeline import open_tracer, steps
+from tiptrace.snapshot import Snapshot
 from tiptrace.streams.live import LiveStream, check_frames
 from tiptrace.streams.recording import Recording
-from tiptrace.types import (
-    SIDES,
-    ImageSample,
-    Phase,
-    PhaseSample,
-    PoseSample,
-    Sample,
-    Side,
-    Snapshot,
-    Status,
-)
+from tiptrace.types import SIDES, ImageSample, Phase, PhaseSample, PoseSample, Sample, Side, Status
 
 
 class FeedRobot(Closing):

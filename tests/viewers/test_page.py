@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from tiptrace.errors import ConfigError, OutputError
-from tiptrace.types import Event, FingerView, Phase, Snapshot, Status, TipEstimate
+from tiptrace.snapshot import FingerView, Snapshot
+from tiptrace.types import Event, Phase, Status, TipEstimate
 from tiptrace.viewers.live import parse_address, watch_live
 from tiptrace.viewers.page import PageServer, host_is_ours
 from tiptrace.viewers.page_data import ellipse, state

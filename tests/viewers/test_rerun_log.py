@@ -10,18 +10,9 @@ import pytest
 
 from tiptrace.errors import OutputError
 from tiptrace.sim.spec import TrialSpec
+from tiptrace.snapshot import FingerView, Snapshot
 from tiptrace.streams.simulated import SimulatedStream
-from tiptrace.types import (
-    SIDES,
-    Event,
-    FingerView,
-    Phase,
-    Snapshot,
-    Status,
-    TipEstimate,
-    TipTrajectory,
-    TruthSample,
-)
+from tiptrace.types import SIDES, Event, Phase, Status, TipEstimate, TipTrajectory, TruthSample
 from tiptrace.viewers.rerun_log import RerunLog
 
 pytest.importorskip("rerun.chunk", reason="extra viz is not installed, or is older than its reader of files")

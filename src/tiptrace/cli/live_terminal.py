@@ -18,7 +18,8 @@ from tiptrace.calibration.gel_health import GelHealth
 from tiptrace.drivers.base import DeviceHealth, DeviceStatus
 from tiptrace.live.session import LiveSession
 from tiptrace.live.summary import LiveSummary
-from tiptrace.types import Phase, Snapshot, Status
+from tiptrace.snapshot import Snapshot
+from tiptrace.types import Phase, Status
 
 _REFRESH_S = 0.2
 _LINE_S = 1.0

@@ -12,10 +12,11 @@ import typer
 from tiptrace.cli.options import MapFile
 
 if TYPE_CHECKING:
+    from tiptrace.snapshot import Snapshot
     from tiptrace.streams.foreign import ForeignRecording
     from tiptrace.streams.recording import Recording
     from tiptrace.tracer import TipTracer
-    from tiptrace.types import Snapshot, TipTrajectory
+    from tiptrace.types import TipTrajectory
 
 
 def view(

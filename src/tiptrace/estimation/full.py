@@ -6,25 +6,24 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
 
 from tiptrace.config import Rig, Tool
 from tiptrace.estimation.anchor import TipPrior
 from tiptrace.estimation.arrangement import ArrangementWatch
 from tiptrace.estimation.carry_over import StageTwoStep, carried_over
 from tiptrace.estimation.event_log import EventLog
-from tiptrace.estimation.integrity import Findings, IntegrityConfig, Monitor
-from tiptrace.estimation.motion import MotionConfig, Motions, TemplateFit
+from tiptrace.estimation.full_config import FullConfig
+from tiptrace.estimation.integrity import Findings, Monitor
+from tiptrace.estimation.motion import Motions, TemplateFit
 from tiptrace.estimation.observability import advice, weak_axes
 from tiptrace.estimation.pads import PadMarkers
-from tiptrace.estimation.patch import PatchConfig
-from tiptrace.estimation.phases import PhaseConfig, PhaseDetector
+from tiptrace.estimation.phases import PhaseDetector
 from tiptrace.estimation.pose_track import HandStates, PoseTrack
 from tiptrace.estimation.priors import calibrated_latency, require_tip, tip_prior
-from tiptrace.estimation.propagation import Tip, propagate
-from tiptrace.estimation.reanchor import ReanchorConfig, Reanchoring
-from tiptrace.estimation.stage_one import Anchoring, RunningTip, StageOne, StageOneConfig
-from tiptrace.estimation.tip_map import P, TipMapConfig
+from tiptrace.estimation.propagation import Tip, Velocity, propagate
+from tiptrace.estimation.reanchor import Reanchoring
+from tiptrace.estimation.stage_one import Anchoring, RunningTip, StageOne
+from tiptrace.estimation.tip_map import P
 from tiptrace.estimation.verdict import Verdict
 from tiptrace.estimation.warm_up import warm_up
 from tiptrace.types import Anchor, Event, FloatArray, Phase, PoseSample, SensedPair, Status, TipEstimate
@@ -34,33 +33,6 @@ _TOO_FEW = "fewer markers than a rigid motion needs, or none on one pad"
 _SLIPPED_EARLY = (
     "the tool slipped in the grasp while its tip rested: Stage I was solved in parts, before and after"
 )
-
-
-class FullConfig(BaseModel):
-    """Settings of the full estimator; the defaults were chosen on simulated trials with seeds below 1000.
-
-    ``use_stage_one = False`` takes the tip from the tool's file (``--tip``); with ``relative = True`` too the tip is
-    not asked for, and positions are displacements from the first contact.
-    """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    patch: PatchConfig = PatchConfig()
-    motion: MotionConfig = MotionConfig()
-    tip_map: TipMapConfig = TipMapConfig()
-    stage_one: StageOneConfig = StageOneConfig()
-    integrity: IntegrityConfig = IntegrityConfig()
-    phases: PhaseConfig = PhaseConfig()
-    reanchor: ReanchorConfig = ReanchorConfig()
-    use_stage_one: bool = True
-    relative: bool = False
-    use_tip_prior: bool = True
-    refuse_sigma_m: float = Field(default=2e-3, gt=0)
-    slip_sigma_m: float = Field(default=1.5e-3, gt=0)
-    pose_half_width_s: float = Field(default=0.05, gt=0)
-    pose_memory_s: float = Field(default=1.0, gt=0.2)
-    tip_noise_m: float = Field(default=1e-4, gt=0)  # hand pose and model at the tip, per frame
-    unknown_tip_m: tuple[float, float] = (0.06, 0.03)  # beyond the pads along z_E, and σ, for displacements
 
 
 class FullEstimator:
@@ -106,7 +78,7 @@ class FullEstimator:
         self._first: Tip | None = None  # first contact, for displacements
         self._in_grasp = (0.0, 0)  # sum of squares of the tip's way against the hand, frames
         self._closure_m: float | None = None
-        self._rate = _Rate()
+        self._in_grasp_velocity = Velocity()
         self.events: list[Event] = []
         self._log = EventLog(self.events)
         self._verdict = Verdict(self._log, c.slip_sigma_m)
@@ -282,9 +254,7 @@ class FullEstimator:
         assert self._anchoring is not None
         a = self._anchoring
         tip = propagate(a.tip_map, motions, 0, hand, a.phase(stamp_ns), self._config.tip_noise_m)
-        v = self._rate.update(
-            stamp_ns, hand.T_B_E[0, :3, :3] @ tip.moved_E
-        )  # in-grasp part of the tip's velocity
+        v = self._in_grasp_velocity.update(stamp_ns, hand.T_B_E[0, :3, :3] @ tip.moved_E)
         self._in_grasp = (self._in_grasp[0] + float(tip.moved_E @ tip.moved_E), self._in_grasp[1] + 1)
         late = a.tip_map.covariance[15, 15] * np.outer(v, v)
         return replace(tip, covariance=tip.covariance + late)
@@ -367,19 +337,3 @@ class FullEstimator:
             self._track.covers(stamp_ns) and self._track.gap_s(stamp_ns) <= self._config.integrity.pose_gap_s
         )
         return self._track.at([stamp_ns]) if known else None
-
-
-class _Rate:
-    """Velocity of a point from its positions, smoothed over about a tenth of a second."""
-
-    def __init__(self) -> None:
-        self._last: tuple[int, FloatArray] | None = None
-        self._v: FloatArray = np.zeros(3)
-
-    def update(self, stamp_ns: int, x: FloatArray) -> FloatArray:
-        if self._last is not None and stamp_ns > self._last[0]:
-            dt = (stamp_ns - self._last[0]) * 1e-9
-            keep = np.exp(-dt / 0.1)
-            self._v = keep * self._v + (1.0 - keep) * (x - self._last[1]) / dt
-        self._last = (stamp_ns, x)
-        return self._v

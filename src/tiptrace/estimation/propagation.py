@@ -69,3 +69,20 @@ def propagate(
     LB = np.concatenate([-L @ skew(shown_at - motions.centre[k]), L], axis=1)  # (3, 6) ∂p_B/∂(ω, v)
     own = tip_map.noise * (LB @ motions.covariance[k] @ LB.T + noise_m**2 * np.eye(3))
     return Tip(p_B, J @ tip_map.covariance @ J.T + own, D, moved, J, own)
+
+
+class Velocity:
+    """Velocity of a point from its positions, smoothed over about a tenth of a second."""
+
+    def __init__(self) -> None:
+        self._last: tuple[int, FloatArray] | None = None
+        self._v: FloatArray = np.zeros(3)
+
+    def update(self, stamp_ns: int, x: FloatArray) -> FloatArray:
+        """Velocity (3,) m/s with the point at x (3,) m now."""
+        if self._last is not None and stamp_ns > self._last[0]:
+            dt = (stamp_ns - self._last[0]) * 1e-9
+            keep = np.exp(-dt / 0.1)
+            self._v = keep * self._v + (1.0 - keep) * (x - self._last[1]) / dt
+        self._last = (stamp_ns, x)
+        return self._v

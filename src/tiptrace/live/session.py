@@ -19,6 +19,7 @@ from tiptrace.live.source_watch import SourceWatch
 from tiptrace.live.summary import LiveSummary, Tally
 from tiptrace.live.views import Views
 from tiptrace.pipeline import Step, open_tracer, steps
+from tiptrace.snapshot import Snapshot
 from tiptrace.streams.live import LiveStream
 from tiptrace.streams.sync_report import SyncReport
 from tiptrace.tracer import TipTracer
@@ -29,7 +30,6 @@ from tiptrace.types import (
     ImageSample,
     Observation,
     Phase,
-    Snapshot,
     Status,
     TipEstimate,
 )

@@ -7,7 +7,8 @@ from collections import deque
 from typing import Any
 
 from tiptrace.pipeline import Step
-from tiptrace.types import SIDES, Event, FingerView, FloatArray, ImageSample, Side, Snapshot
+from tiptrace.snapshot import FingerView, Snapshot
+from tiptrace.types import SIDES, Event, FloatArray, ImageSample, Side
 
 _RATE_WINDOW = 64
 _RATE_MEMORY_S = 3.0

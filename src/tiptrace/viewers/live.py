@@ -10,7 +10,7 @@ from importlib.util import find_spec
 from typing import Protocol
 
 from tiptrace.errors import ConfigError
-from tiptrace.types import Snapshot
+from tiptrace.snapshot import Snapshot
 from tiptrace.viewers.page import PageServer
 
 DEFAULT_PORT = 8321

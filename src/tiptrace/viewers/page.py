@@ -15,7 +15,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from tiptrace.errors import MissingExtraError, OutputError
-from tiptrace.types import Snapshot
+from tiptrace.snapshot import Snapshot
 from tiptrace.viewers.page_data import Row, path_row, state
 
 _PERIOD_S = 0.08  # pictures and numbers at 12 Hz are smooth enough

@@ -8,7 +8,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from tiptrace.types import SIDES, FingerView, Snapshot
+from tiptrace.snapshot import FingerView, Snapshot
+from tiptrace.types import SIDES
 
 Row = list[Any]
 _MAX_EVENTS = 30

@@ -15,7 +15,8 @@ import numpy as np
 
 from tiptrace.config import Rig
 from tiptrace.errors import MissingExtraError, OutputError
-from tiptrace.types import SIDES, FloatArray, Side, Snapshot, TipTrajectory, TruthSample
+from tiptrace.snapshot import Snapshot
+from tiptrace.types import SIDES, FloatArray, Side, TipTrajectory, TruthSample
 from tiptrace.viewers.rerun_blueprint import MAGNIFIED, blueprint
 
 _BLUE, _RED, _GREEN, _GREY = (0, 114, 178), (213, 94, 0), (0, 158, 115), (150, 150, 150)

@@ -7,8 +7,9 @@ from collections import deque
 from collections.abc import Callable
 
 from tiptrace.pipeline import Step
+from tiptrace.snapshot import FingerView, Snapshot
 from tiptrace.tracer import TipTracer
-from tiptrace.types import SIDES, FingerView, FloatArray, ImageSample, Side, Snapshot
+from tiptrace.types import SIDES, FloatArray, ImageSample, Side
 
 _RATE_MEMORY_S = 3.0
 
