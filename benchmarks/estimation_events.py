@@ -23,7 +23,8 @@ from estimation_trials import Trial, simulate, specs
 from estimation_trials import trial as plain_trial
 
 from tiptrace.errors import SimulationError
-from tiptrace.estimation.full import FullConfig, FullEstimator
+from tiptrace.estimation.full import FullEstimator
+from tiptrace.estimation.full_config import FullConfig
 from tiptrace.sim.conditions import CONDITIONS
 from tiptrace.sim.spec import Dwell, FrictionDrop, Lift, Push, TrialSpec
 from tiptrace.types import Event, Phase, TipEstimate

@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from estimation_trials import Trial, specs, trial
@@ -18,13 +19,15 @@ from estimation_trials import Trial, specs, trial
 from tiptrace.errors import SimulationError
 from tiptrace.estimation.baselines import EeOracleEstimator, LocalAnchoringEstimator, NominalTipEstimator
 from tiptrace.estimation.ee_only import EeOnlyEstimator
-from tiptrace.estimation.full import FullConfig, FullEstimator
+from tiptrace.estimation.full import FullEstimator
+from tiptrace.estimation.full_config import FullConfig
 from tiptrace.estimation.paper import PaperEstimator
 from tiptrace.evaluation.metrics import TrialMetrics, evaluate
 from tiptrace.evaluation.quality import assess
-from tiptrace.types import TipTrajectory
+from tiptrace.types import Phase, TipTrajectory
 
 COLUMNS = ("initial_contact_error_mm", "trajectory_rmse_mm", "shape_rmse_mm", "cross_track_rmse_mm")
+NEES_EDGES = tuple(0.5 * k for k in range(33))
 
 
 def full(t: Trial, prior: bool = False) -> FullEstimator:
@@ -54,6 +57,17 @@ def run(t: Trial, method: str) -> tuple[TipTrajectory, TrialMetrics]:
     return trajectory, evaluate(trajectory, t.truth)
 
 
+def nees_counts(trajectory: TipTrajectory, t: Trial) -> list[int]:
+    """Frames of the reconstruction by eᵀ Σ⁻¹ e, in the bins of ``NEES_EDGES``, the last without an end."""
+    rows = [e for e in trajectory.estimates if e.p_B is not None and e.covariance is not None]
+    rows = [e for e in rows if e.phase is Phase.RECONSTRUCTION]
+    if not rows:
+        return [0] * len(NEES_EDGES)
+    error = np.stack([e.p_B for e in rows]) - t.truth.at([e.stamp_ns for e in rows])
+    nees = np.array([x @ np.linalg.solve(e.covariance, x) for x, e in zip(error, rows, strict=True)])
+    return np.histogram(nees[np.isfinite(nees)], [*NEES_EDGES, np.inf])[0].tolist()
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--level", default="nominal")
@@ -64,7 +78,7 @@ def main() -> None:
     parser.add_argument("--cached-only", action="store_true")
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
-    rows: dict[str, list[dict[str, float | str]]] = {m: [] for m in args.methods.split(",")}
+    rows: dict[str, list[dict[str, Any]]] = {m: [] for m in args.methods.split(",")}
     for spec in specs(args.level, args.anchor_motion, range(*map(int, args.seeds.split(":")))):
         try:
             t = trial(spec, args.cache, simulate_missing=not args.cached_only)
@@ -80,6 +94,7 @@ def main() -> None:
                 "usable": m.usable_fraction,
             }
             row |= {"name": spec.name, "seed": spec.seed, "nees": m.nees_median}
+            row["nees_counts"] = nees_counts(trajectory, t)
             row["verdict"] = assess(trajectory).verdict
             row["prior_mm"] = float(np.linalg.norm(t.nominal_error_m)) * 1e3
             row["events"] = ",".join(e.kind for e in trajectory.events)
@@ -90,7 +105,7 @@ def main() -> None:
         args.json.write_text(json.dumps(rows))
 
 
-def report(args: argparse.Namespace, rows: dict[str, list[dict[str, float | str]]]) -> None:
+def report(args: argparse.Namespace, rows: dict[str, list[dict[str, Any]]]) -> None:
     print(f"\n{args.level}, {args.anchor_motion}, seeds {args.seeds}")
     print(
         "| method | trials | failed | contact | trajectory | p95 | shape | cross-track | coverage | usable |"
@@ -118,7 +133,7 @@ def report(args: argparse.Namespace, rows: dict[str, list[dict[str, float | str]
         print(f"  events of full: { ({k: told.count(k) for k in set(told)}) } in {minutes:.1f} minutes")
 
 
-def report_verdicts(rows: list[dict[str, float | str]]) -> None:
+def report_verdicts(rows: list[dict[str, Any]]) -> None:
     for verdict in ("pass", "warn", "fail"):
         error = [float(r["trajectory_rmse_mm"]) for r in rows if r["verdict"] == verdict]
         known = [e for e in error if np.isfinite(e)]
