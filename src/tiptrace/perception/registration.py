@@ -73,8 +73,11 @@ class RegisteredTracker:
         dots = self._meter.measure(grey, guess)
         near = max(2.0, 0.12 * self._around.pitch_px), _SEARCH * self._around.pitch_px
         seen = self._is_dot(dots, guess, np.where(followed, *near), _EVERY, grey.shape)
+        kept = seen & followed
+        again = np.flatnonzero(seen & ~followed)
+        seen[again] = _nearest_to_own(dots.uv_px[again], np.where(kept[:, None], dots.uv_px, guess), again)
         uv, seen = self._search(grey, guess, dots.uv_px, seen)
-        seen = self._agree(uv, seen)
+        seen = self._agree(grey, uv, seen, kept)
         predicted, _ = self._around.predict(uv - self._rest, seen)
         self.expected_px = np.where(seen[:, None], uv, self._rest + predicted)
         self._tracked, self._grey = seen, grey
@@ -90,7 +93,7 @@ class RegisteredTracker:
             start, moved, back, there & again & self._tracked, _LEAP * self._around.pitch_px
         )
         limit = _OFF_GRID * self._around.pitch_px
-        followed = self._around.drop_strays(moved - self._rest, followed, limit)
+        followed = self._around.drop_strays(moved - start, followed, limit)
         predicted, enough = self._around.predict(moved - self._rest, followed)
         held = np.where(enough[:, None], self._rest + predicted, start)
         return np.where(followed[:, None], moved, held), followed
@@ -139,7 +142,9 @@ class RegisteredTracker:
         found = self._meter.measure(grey, uv[missing])
         uv[missing] = found.uv_px
         reach = np.full(len(missing), _FOUND * self._around.pitch_px)
+        places = np.where(seen[:, None], uv, guess)  # of all markers, as far as is known
         seen[missing] = self._is_dot(found, guess[missing], reach, missing, grey.shape)
+        seen[missing] &= _nearest_to_own(found.uv_px, places, missing)
         return uv, seen
 
     def _darkest(self, grey: Grey, guess: FloatArray) -> tuple[int, int]:
@@ -154,12 +159,42 @@ class RegisteredTracker:
         _, _, (x, y), _ = cv2.minMaxLoc(core)
         return u1 + x, v1 + y
 
-    def _agree(self, uv: FloatArray, seen: BoolArray) -> BoolArray:
-        """Drop markers off their neighbours' displacement, worst first, and two markers on one dot."""
-        limit = _OFF_GRID * self._around.pitch_px
-        seen, off = self._around.agreeing(uv - self._rest, seen, limit)
-        _part_twins(uv, off, seen, self._margin)
-        return seen
+    def _agree(self, grey: Grey, uv: FloatArray, seen: BoolArray, followed: BoolArray) -> BoolArray:
+        """Drop markers off their neighbours' displacement, worst first, and two markers on one dot.
+
+        Gel that breaks loose shears by up to a pitch between rows: a dot that was followed here is only given up
+        where another, that is nobody's, shows at the place that the neighbours name.
+        """
+        agreed, off = self._around.agreeing(uv - self._rest, seen, _OFF_GRID * self._around.pitch_px)
+        strays = np.flatnonzero(followed & ~agreed)
+        if strays.size:
+            predicted, _ = self._around.predict(uv - self._rest, agreed)
+            agreed[strays] = ~self._show(grey, self._rest + predicted, uv, strays, seen)
+        _part_twins(uv, off, agreed, self._margin)
+        return agreed
+
+    def _show(
+        self, grey: Grey, places: FloatArray, uv: FloatArray, which: NDArray[np.intp], seen: BoolArray
+    ) -> BoolArray:
+        """Whether dots of some markers (m,) show at places (n, 2) where no marker is seen (n,)."""
+        dots = self._meter.measure(grey, places[which])
+        reach = np.full(len(which), _OFF_GRID * self._around.pitch_px)
+        found = self._is_dot(dots, places[which], reach, which, grey.shape)
+        taken = np.linalg.norm(dots.uv_px[:, None] - uv[seen], axis=2).min(axis=1) < self._margin
+        return np.asarray(found & ~taken)
+
+
+@compiled
+def _nearest_to_own(found: FloatArray, places: FloatArray, missing: NDArray[np.intp]) -> BoolArray:
+    """Whether dots (m, 2) found for missing markers lie nearer to these than to any other marker's place (n, 2)."""
+    own = np.ones(len(missing), dtype=np.bool_)
+    for k in range(len(missing)):
+        u, v = found[k]
+        i = missing[k]
+        away = (u - places[i, 0]) ** 2 + (v - places[i, 1]) ** 2
+        for j in range(len(places)):
+            own[k] &= j == i or away <= (u - places[j, 0]) ** 2 + (v - places[j, 1]) ** 2
+    return own
 
 
 @compiled
