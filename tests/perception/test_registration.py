@@ -134,3 +134,18 @@ def test_a_patch_carried_by_more_than_half_a_pitch_keeps_its_dots():
     carried = seeds.markers.uv_px[:, 0] - seeds.rest_px[:, 0]
     across = np.abs(seeds.markers.uv_px[:, 1] - 120.0)
     assert np.abs(carried + 0.6 * 31.0 * np.clip(1.4 - across / 80.0, 0.0, 1.0)).max() < 0.6
+
+
+def test_a_row_that_breaks_loose_leaves_the_image_and_comes_back_under_its_own_indices():
+    """Gel shears between rows by almost a pitch; the dot that leaves must not take its neighbour's when it is back."""
+    rest = grid()
+    tracker, order = start(rest)
+    row = np.abs(rest[:, 1] - H / 2) < 16
+    way = 26.0 * np.sin(np.linspace(0, 2 * np.pi, 49))[1:]  # px, 3.4 a frame at most
+    for t, x in enumerate(way):
+        uv = rest + np.where(row, x, 0.15 * x)[:, None] * [1.0, 0.0]
+        found, tracked = step(tracker, order, uv, seed=t)
+        swapped = np.linalg.norm(found - uv, axis=1)[tracked] > 8.0
+        assert not swapped.any(), t
+        assert tracked[INTERIOR].mean() > 0.9, t
+    assert tracked[INTERIOR].all()
