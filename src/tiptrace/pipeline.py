@@ -127,15 +127,22 @@ def replay(pairs: Iterable[SensedPair], tracer: TipTracer) -> TipTrajectory:
 
 @contextmanager
 def open_tracer(stream: Stream, method: str, options: TracerOptions = DEFAULT_OPTIONS) -> Iterator[TipTracer]:
-    """A tracer with one thread per finger.
+    """A tracer with one thread per finger; OpenCV, which would share out each small call, keeps to these meanwhile.
 
     Raises:
         ConfigError: an unknown method; the valid ones are listed.
     """
     from concurrent.futures import ThreadPoolExecutor
 
-    with ThreadPoolExecutor(max_workers=2, thread_name_prefix="finger") as pool:
-        yield make_tracer(stream, method, both=pool.map, options=options)
+    import cv2
+
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        with ThreadPoolExecutor(max_workers=2, thread_name_prefix="finger") as pool:
+            yield make_tracer(stream, method, both=pool.map, options=options)
+    finally:
+        cv2.setNumThreads(threads)
 
 
 def _timed(observations: Iterator[Observation]) -> Iterator[tuple[Observation, float]]:
