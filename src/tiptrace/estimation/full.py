@@ -29,6 +29,7 @@ from tiptrace.estimation.warm_up import warm_up
 from tiptrace.types import Anchor, Event, FloatArray, Phase, PoseSample, SensedPair, Status, TipEstimate
 
 _TEMPLATE_FRAMES = 5
+_PAUSE_NS = 150_000_000  # between pairs, beyond which their motion is not taken for a kick
 _TOO_FEW = "fewer markers than a rigid motion needs, or none on one pad"
 _SLIPPED_EARLY = (
     "the tool slipped in the grasp while its tip rested: Stage I was solved in parts, before and after"
@@ -76,6 +77,7 @@ class FullEstimator:
         self._anchor: Anchor | None = None
         self._refused = self._relative = False
         self._first: Tip | None = None  # first contact, for displacements
+        self._last_ns = 0  # last pair that Stage II could use
         self._in_grasp = (0.0, 0)  # sum of squares of the tip's way against the hand, frames
         self._closure_m: float | None = None
         self._in_grasp_velocity = Velocity()
@@ -234,6 +236,9 @@ class FullEstimator:
             self._log.note("too-few-markers", stamp_ns, stamp_ns, _TOO_FEW)
             return estimate
         tip = self._propagate(pair.stamp_ns, motions, hand)
+        if pair.stamp_ns - self._last_ns > _PAUSE_NS:
+            self._monitor.resume()
+        self._last_ns = pair.stamp_ns
         status, extra = self._verdict.of(stamp_ns, self._judge(markers, motions, hand, repeated))
         self._report_step(pair.stamp_ns, motions, hand, extra)
         R_B_E = hand.T_B_E[0, :3, :3] @ motions.R[0]

@@ -65,6 +65,11 @@ class Monitor:
         self._last_residual = None
         self._twisted = 0
 
+    def resume(self) -> None:
+        """Go on after a pause: what moved meanwhile is no kick."""
+        self._slip = SlipDetector(self._config.slip)
+        self._last_residual = None
+
     def repeated(self, x_S: FloatArray, pad: FloatArray) -> tuple[bool, bool]:
         """Whether each finger's frame equals the last one; call once per frame, first."""
         same = [False, False]

@@ -25,6 +25,7 @@ _SAME_BRIGHTNESS = 0.02
 _AREA = (0.4, 2.2)  # of the first frame's
 _INK = 0.45  # of the first frame's contrast
 _OFF_GRID = 0.38  # of the pitch: distance from where the neighbours say
+_STEADY = 0.3  # of the pitch: a dot that moved less since the frame before is the same dot for certain
 _SEARCH = 0.45  # of the pitch: how far from its predicted place a lost dot is looked for …
 _FOUND = 0.6  # … and may be found
 _MARGIN_PX = 1.0  # around a dot, where the network must not look either
@@ -73,7 +74,7 @@ class RegisteredTracker:
         dots = self._meter.measure(grey, guess)
         near = max(2.0, 0.12 * self._around.pitch_px), _SEARCH * self._around.pitch_px
         seen = self._is_dot(dots, guess, np.where(followed, *near), _EVERY, grey.shape)
-        kept = seen & followed
+        kept = seen & followed & self._steady(dots.uv_px)
         again = np.flatnonzero(seen & ~followed)
         seen[again] = _nearest_to_own(dots.uv_px[again], np.where(kept[:, None], dots.uv_px, guess), again)
         uv, seen = self._search(grey, guess, dots.uv_px, seen)
@@ -94,9 +95,15 @@ class RegisteredTracker:
         )
         limit = _OFF_GRID * self._around.pitch_px
         followed = self._around.drop_strays(moved - start, followed, limit)
+        followed &= self._steady(moved) | self._around.drop_strays(moved - self._rest, followed, limit)
         predicted, enough = self._around.predict(moved - self._rest, followed)
         held = np.where(enough[:, None], self._rest + predicted, start)
         return np.where(followed[:, None], moved, held), followed
+
+    def _steady(self, uv: FloatArray) -> BoolArray:
+        """Markers (n,) that are not far from where they were in the frame before."""
+        step = np.linalg.norm(uv - self.expected_px, axis=1)
+        return np.asarray(step < _STEADY * self._around.pitch_px)
 
     def _as_bright_as_before(self, grey: Grey) -> Grey:
         """Lucas–Kanade takes a change of brightness for motion: lamps are evened out first."""
