@@ -25,7 +25,11 @@ _SAME_BRIGHTNESS = 0.02
 _AREA = (0.4, 2.2)  # of the first frame's
 _INK = 0.45  # of the first frame's contrast
 _OFF_GRID = 0.38  # of the pitch: distance from where the neighbours say
-_STEADY = 0.3  # of the pitch: a dot that moved less since the frame before is the same dot for certain
+_STEADY = 0.3  # of the pitch: a dot that moved less since the frame before is the same dot for certain …
+_LEAPT, _DOUBT_FRAMES = (
+    0.1,
+    75,
+)  # … but for so many frames after one in which this share of all leapt: a pause
 _SEARCH = 0.45  # of the pitch: how far from its predicted place a lost dot is looked for …
 _FOUND = 0.6  # … and may be found
 _MARGIN_PX = 1.0  # around a dot, where the network must not look either
@@ -50,6 +54,7 @@ class RegisteredTracker:
         self._ink, self._area = first.ink, first.area_px
         self._margin = 0.4 * diameter
         self._tracked = np.ones(len(markers), dtype=np.bool_)
+        self._doubt = 0  # frames to go until followed dots are believed again
         self._missed, self._frame = np.zeros(len(markers), dtype=np.intp), 0
         self.expected_px: FloatArray = self._rest.copy()
 
@@ -74,7 +79,10 @@ class RegisteredTracker:
         dots = self._meter.measure(grey, guess)
         near = max(2.0, 0.12 * self._around.pitch_px), _SEARCH * self._around.pitch_px
         seen = self._is_dot(dots, guess, np.where(followed, *near), _EVERY, grey.shape)
-        kept = seen & followed & self._steady(dots.uv_px)
+        steady = self._steady(dots.uv_px)
+        leapt = np.count_nonzero(seen & ~steady) > _LEAPT * len(seen)
+        self._doubt = _DOUBT_FRAMES if leapt else max(self._doubt - 1, 0)
+        kept = seen & followed & steady & (self._doubt == 0)
         again = np.flatnonzero(seen & ~followed)
         seen[again] = _nearest_to_own(dots.uv_px[again], np.where(kept[:, None], dots.uv_px, guess), again)
         uv, seen = self._search(grey, guess, dots.uv_px, seen)
@@ -95,7 +103,8 @@ class RegisteredTracker:
         )
         limit = _OFF_GRID * self._around.pitch_px
         followed = self._around.drop_strays(moved - start, followed, limit)
-        followed &= self._steady(moved) | self._around.drop_strays(moved - self._rest, followed, limit)
+        sure = self._steady(moved) & (self._doubt == 0)
+        followed &= sure | self._around.drop_strays(moved - self._rest, followed, limit)
         predicted, enough = self._around.predict(moved - self._rest, followed)
         held = np.where(enough[:, None], self._rest + predicted, start)
         return np.where(followed[:, None], moved, held), followed
