@@ -42,7 +42,7 @@ def draw_prior(found: dict[str, Rows], path: Path) -> None:
         )
         ax.set_xlim(0, None)
         ax.spines[["top", "right"]].set_visible(False)
-    axes[0, 0].legend(frameon=False)
+    axes[0, 0].legend(frameon=True, loc="upper center")
     figure.tight_layout()
     figure.savefig(path, dpi=130)
     plt.close(figure)
