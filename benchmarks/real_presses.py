@@ -63,7 +63,7 @@ def hold_out(folder: PressFolder, test: list[int], seed: int) -> list[Held]:
     training = replace(folder, presses=tuple(p for i, p in enumerate(folder.presses) if i not in test))
     shading = shading_of(training, find_circles(training), one_place=True)
     rng = np.random.default_rng(seed)
-    network = train_network(shading, folder.background, pixel_noise(folder), CONVENTION, rng)
+    network = train_network([shading], folder.background, pixel_noise(folder), CONVENTION, rng)
     gel = GelModel(mlp_to_onnx(network.weights, network.biases, CONVENTION))
     presses = [folder.presses[i] for i in test]
     return [Held(p, score_press(gel, p, locate(p, folder, shading), folder)) for p in presses]

@@ -204,7 +204,7 @@ def test_from_recording_to_rig_file(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         main()
     assert not stop.value.code
     text = capsys.readouterr().out
-    assert "T_E_S translation" in text
+    assert "T_E_S, x_E [mm]" in text
     assert "±" in text
     new = load_yaml(Rig, tmp_path / "rig.yaml")
     T = stream.true_rig.sensor("left").T_E_S.matrix()
