@@ -15,7 +15,8 @@ from tiptrace.estimation.motion import MotionConfig, Motions
 from tiptrace.estimation.observability import weak_axes
 from tiptrace.estimation.planning import CANDIDATES, Task, Wiggle, _motions
 from tiptrace.estimation.pose_track import HandStates, smooth_at
-from tiptrace.estimation.tip_map import P, TipMapConfig, solve_tip_map
+from tiptrace.estimation.tip_map import solve_tip_map
+from tiptrace.estimation.tip_map_config import P, TipMapConfig
 from tiptrace.geometry.transforms import invert, rotation_exp, rotation_log
 from tiptrace.sim.rig import true_rig
 from tiptrace.sim.spec import TrialSpec

@@ -12,11 +12,12 @@ import numpy as np
 from tiptrace.config import Tool
 from tiptrace.errors import OutputError
 from tiptrace.estimation.anchor import TipPrior
-from tiptrace.estimation.integrity import Reference
+from tiptrace.estimation.integrity_reference import Reference
 from tiptrace.estimation.motion import MotionConfig, TemplateFit
 from tiptrace.estimation.slip_detector import SlipLevels
 from tiptrace.estimation.stage_one import Anchoring
-from tiptrace.estimation.tip_map import C, TipMap
+from tiptrace.estimation.tip_map import TipMap
+from tiptrace.estimation.tip_map_config import C
 from tiptrace.evaluation.atomic import write_atomic
 
 GRASP = "grasp.json"

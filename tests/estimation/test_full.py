@@ -199,6 +199,20 @@ def test_a_kick_into_another_pattern_means_a_slip() -> None:
     assert "grasp-slip" in kinds(slip)
 
 
+def test_what_moved_in_a_pause_is_no_kick() -> None:
+    """The same jump, but no pairs came for half a second about it."""
+    trial = Synthetic(seed=9, tip_offset_m=OFFSET)
+    estimator = FullEstimator(rig=rig())
+    pairs = trial.pairs()
+
+    def slip(k: int, x: FloatArray, _: list[SensedPair]) -> FloatArray:
+        return x + np.array([8e-4, 0.0, 0.0]) if k >= 140 else x
+
+    slipped = corrupted(pairs, slip)
+    run(estimator, slipped[:134] + slipped[147:])
+    assert "grasp-slip" not in {e.kind for e in estimator.events}
+
+
 def test_pads_that_turn_apart_disagree() -> None:
     def slide(k: int, x: FloatArray, pairs: list[SensedPair]) -> FloatArray:
         if k >= 140:

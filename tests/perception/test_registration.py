@@ -149,3 +149,17 @@ def test_a_row_that_breaks_loose_leaves_the_image_and_comes_back_under_its_own_i
         assert not swapped.any(), t
         assert tracked[INTERIOR].mean() > 0.9, t
     assert tracked[INTERIOR].all()
+
+
+def test_a_patch_that_leapt_to_the_next_dots_in_a_pause_finds_back():
+    """Nobody saw the way between: the patch's rim, held against its untouched neighbours, mends it from outside in."""
+    rest = grid()
+    tracker, order = start(rest)
+    patch = np.exp(-((np.abs(rest[:, 1] - H / 2) / 60.0) ** 4))[:, None] * [1.0, 0.0]
+    swapped = []
+    for t, x in enumerate([*np.linspace(0, -12, 6), 13.0, *(13.0 + 0.5 * np.sin(np.arange(85) / 5))]):
+        found, tracked = step(tracker, order, rest + x * patch, seed=t)
+        swapped.append((np.linalg.norm(found - rest - x * patch, axis=1)[tracked] > 8.0).sum())
+    assert max(swapped[:6]) == 0
+    assert swapped[6] > 10  # else this shows nothing
+    assert swapped[-1] == 0

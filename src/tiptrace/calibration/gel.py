@@ -114,8 +114,8 @@ def train_gel(
     convention = Convention(background="ratio", coordinates="zero" if one_place else "unit")
     network = train_network([shading], data.background, pixel_noise(data), convention, rng, tell)
     valid = coverage(found)
-    metadata = _metadata(data, valid, shading) | {"one_place": "yes" if one_place else "no"}
-    out.write_bytes(mlp_to_onnx(network.weights, network.biases, convention, metadata=metadata))
+    described = metadata(data, valid, shading.max_slope, one_place=one_place)
+    out.write_bytes(mlp_to_onnx(network.weights, network.biases, convention, metadata=described))
     gel = GelModel(out.read_bytes(), str(out))
     tested = [data.presses[i] for i in test]
     scores = tuple(score_press(gel, p, c, data) for p, c in zip(tested, held_out, strict=True))
@@ -177,13 +177,24 @@ def coverage(circles: list[Circle]) -> tuple[float, float, float, float]:
     return float(low[0]), float(low[1]), float(high[0]), float(high[1])
 
 
-def _metadata(data: PressFolder, valid: tuple[float, ...], shading: Shading) -> dict[str, str]:
+def metadata(
+    data: PressFolder, valid: tuple[float, ...], max_slope: float, *, one_place: bool
+) -> dict[str, str]:
+    """What a network's file says of where it comes from and where it holds.
+
+    Args:
+        data: The presses.
+        valid: Rectangle (u_min, v_min, u_max, v_max) that they cover, px.
+        max_slope: Steepest slope in them.
+        one_place: Whether the network takes no account of the place.
+    """
     H, W = data.reference.shape[:2]
     return {
         "mm_per_px": ",".join(f"{s:.6g}" for s in data.mm_per_px),
         "image_size_px": f"{W},{H}",
         "valid_px": ",".join(f"{x:.1f}" for x in valid),
-        "max_slope": f"{shading.max_slope:.3f}",
+        "max_slope": f"{max_slope:.3f}",
         "hidden": "-".join(map(str, HIDDEN)),
         "presses": str(len(data.presses)),
+        "one_place": "yes" if one_place else "no",
     }

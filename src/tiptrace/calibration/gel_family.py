@@ -13,11 +13,11 @@ from pathlib import Path
 
 import numpy as np
 
-from tiptrace.calibration.gel import coverage, pixel_noise
+from tiptrace.calibration.gel import coverage, metadata, pixel_noise
 from tiptrace.calibration.gel_circles import PressSamples, contact_samples, find_circles, locate
 from tiptrace.calibration.gel_data import MIN_PRESSES, Circle, Press, PressFolder, read_press_folder
 from tiptrace.calibration.gel_evaluation import PressScore, score_press
-from tiptrace.calibration.gel_network import HIDDEN, Progress, train_network
+from tiptrace.calibration.gel_network import Progress, train_network
 from tiptrace.calibration.gel_onnx import mlp_to_onnx
 from tiptrace.calibration.gel_shading import Shading, fit_change, fit_shading
 from tiptrace.errors import CalibrationError
@@ -99,8 +99,10 @@ def train_family(
     network = train_network(
         shadings, data.background, pixel_noise(data), convention, rng, tell, steepest=_TAUGHT
     )
-    metadata = _metadata(data, coverage(circles), shadings[0].max_slope, gels)
-    out.write_bytes(mlp_to_onnx(network.weights, network.biases, convention, metadata=metadata))
+    described = metadata(data, coverage(circles), shadings[0].max_slope, one_place=False) | {
+        "gels": str(gels)
+    }
+    out.write_bytes(mlp_to_onnx(network.weights, network.biases, convention, metadata=described))
     gel = GelModel(out.read_bytes(), str(out))
     return FamilyReport(
         gels=gels,
@@ -121,17 +123,3 @@ def _shadings(samples: list[list[FloatArray]]) -> list[Shading]:
     """Shading of each gel: that of all presses, and what its own presses add."""
     pooled = fit_shading(*(np.concatenate(columns) for columns in zip(*samples, strict=True)))
     return [replace(pooled, coefficients=pooled.coefficients + fit_change(pooled, *own)) for own in samples]
-
-
-def _metadata(data: PressFolder, valid: tuple[float, ...], max_slope: float, gels: int) -> dict[str, str]:
-    H, W = data.reference.shape[:2]
-    return {
-        "mm_per_px": ",".join(f"{s:.6g}" for s in data.mm_per_px),
-        "image_size_px": f"{W},{H}",
-        "valid_px": ",".join(f"{x:.1f}" for x in valid),
-        "max_slope": f"{max_slope:.3f}",
-        "hidden": "-".join(map(str, HIDDEN)),
-        "presses": str(len(data.presses)),
-        "gels": str(gels),
-        "one_place": "no",
-    }

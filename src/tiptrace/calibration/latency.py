@@ -20,7 +20,7 @@ from tiptrace.estimation.pads import PadMarkers
 from tiptrace.estimation.patch import PatchConfig
 from tiptrace.estimation.phases import PhaseConfig, PhaseDetector
 from tiptrace.estimation.stage_one import Anchoring, StageOne, StageOneConfig
-from tiptrace.estimation.tip_map import TipMapConfig
+from tiptrace.estimation.tip_map_config import TipMapConfig
 from tiptrace.types import Phase, SensedPair
 
 _PRIOR_S = (0.05, 0.15)  # mean and σ: says next to nothing

@@ -41,15 +41,12 @@ def calibrate_latency(
     from tiptrace.calibration.latency import rig_with_latency
     from tiptrace.cli.show import progress_bar
     from tiptrace.config import dump_yaml
-    from tiptrace.errors import ConfigError
     from tiptrace.evaluation.atomic import write_atomic
     from tiptrace.perception.settings import SensingConfig
     from tiptrace.streams.sources import open_recording
     from tiptrace.streams.synchronise import synchronise
     from tiptrace.tracer import Sensing
 
-    if depth not in ("network", "none"):
-        raise ConfigError(f"--depth {depth}: valid are network and none")
     stream = open_recording(
         recording,
         map_file=map_file,

@@ -47,12 +47,9 @@ def calibrate_rig(
     from tiptrace.calibration.rig import calibrate_rig as solve
     from tiptrace.cli.show import progress_bar
     from tiptrace.config import dump_yaml
-    from tiptrace.errors import ConfigError
     from tiptrace.evaluation.atomic import write_atomic
     from tiptrace.streams.sources import open_recording
 
-    if depth not in ("network", "none"):
-        raise ConfigError(f"--depth {depth}: valid are network and none")
     options: dict[str, Any] = {
         "map_file": map_file,
         "rig": rig,

@@ -19,10 +19,8 @@ JPEG_QUALITY = 95
 _FLIP = {"horizontal": 1, "vertical": 0, "both": -1}
 _MOST_PX = 32_000_000
 _BLOCKS = (16, 12)  # of which the picture's means are compared, x and y
-_BLOCK_STEP, _MANY_BLOCKS = (
-    40.0,
-    6,
-)  # grey levels by which the means of so many change where no gel moves like that
+_BLOCK_STEP = 40.0  # grey levels by which no gel changes the means …
+_MANY_BLOCKS = 6  # … of so many blocks
 _SHIFT = 5.0  # grey levels; a real camera's pictures shift by 2.6
 _SAME_STEP, _SAME_BLOCKS = 20.0, 3  # the same between two pictures of one thing
 _SHARPER, _SHARPNESS = 2.0, 16.0  # times the picture before, and grey levels times 8 more

@@ -23,13 +23,12 @@ from tiptrace.estimation.priors import calibrated_latency, require_tip, tip_prio
 from tiptrace.estimation.propagation import Tip, Velocity, propagate
 from tiptrace.estimation.reanchor import Reanchoring
 from tiptrace.estimation.stage_one import Anchoring, RunningTip, StageOne
-from tiptrace.estimation.tip_map import P
+from tiptrace.estimation.tip_map_config import P
 from tiptrace.estimation.verdict import Verdict
 from tiptrace.estimation.warm_up import warm_up
 from tiptrace.types import Anchor, Event, FloatArray, Phase, PoseSample, SensedPair, Status, TipEstimate
 
 _TEMPLATE_FRAMES = 5
-_PAUSE_NS = 150_000_000  # between pairs, beyond which their motion is not taken for a kick
 _TOO_FEW = "fewer markers than a rigid motion needs, or none on one pad"
 _SLIPPED_EARLY = (
     "the tool slipped in the grasp while its tip rested: Stage I was solved in parts, before and after"
@@ -236,7 +235,7 @@ class FullEstimator:
             self._log.note("too-few-markers", stamp_ns, stamp_ns, _TOO_FEW)
             return estimate
         tip = self._propagate(pair.stamp_ns, motions, hand)
-        if pair.stamp_ns - self._last_ns > _PAUSE_NS:
+        if pair.stamp_ns - self._last_ns > self._config.integrity.pause_s * 1e9:
             self._monitor.resume()
         self._last_ns = pair.stamp_ns
         status, extra = self._verdict.of(stamp_ns, self._judge(markers, motions, hand, repeated))

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from tiptrace.estimation.integrity import IntegrityConfig
+from tiptrace.estimation.integrity_reference import IntegrityConfig
 from tiptrace.estimation.motion import MotionConfig
 from tiptrace.estimation.patch import PatchConfig
 from tiptrace.estimation.phases import PhaseConfig
 from tiptrace.estimation.reanchor import ReanchorConfig
 from tiptrace.estimation.stage_one import StageOneConfig
-from tiptrace.estimation.tip_map import TipMapConfig
+from tiptrace.estimation.tip_map_config import TipMapConfig
 
 
 class FullConfig(BaseModel):

@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from tiptrace.estimation.integrity import Reference, reference
+from tiptrace.estimation.integrity_reference import Reference, reference
 from tiptrace.estimation.motion import MotionConfig, Motions, TemplateFit
 from tiptrace.types import BoolArray, FloatArray
 

@@ -11,12 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from tiptrace.estimation.contact_watch import ContactWatch
-from tiptrace.estimation.integrity_reference import IntegrityConfig, Reference, reference
+from tiptrace.estimation.integrity_reference import IntegrityConfig, Reference
 from tiptrace.estimation.motion import Motions
 from tiptrace.estimation.slip_detector import SlipDetector
 from tiptrace.types import BoolArray, FloatArray, IntArray
-
-__all__ = ["Findings", "IntegrityConfig", "Monitor", "Reference", "reference"]
 
 
 @dataclass(frozen=True, slots=True)

@@ -36,6 +36,7 @@ class IntegrityConfig(BaseModel):
     landing_frames: int = Field(default=25, ge=0)  # after a loss, in which a snap of the tip is no slip
     lost_frames: int = Field(default=5, ge=1)  # a marker not seen for so long is told
     pose_gap_s: float = Field(default=0.1, gt=0)
+    pause_s: float = Field(default=0.15, gt=0)  # between pairs, beyond which their motion is no kick
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,8 @@ import numpy as np
 from tiptrace.config import Rig
 from tiptrace.estimation.motion import MotionConfig, Motions, TemplateFit
 from tiptrace.estimation.pose_track import HandStates, smooth_at
-from tiptrace.estimation.tip_map import P, TipMapConfig, solve_tip_map
+from tiptrace.estimation.tip_map import solve_tip_map
+from tiptrace.estimation.tip_map_config import P, TipMapConfig
 from tiptrace.geometry.transforms import invert, rotation_exp, transform
 from tiptrace.types import SIDES, FloatArray
 

@@ -11,7 +11,8 @@ import numpy as np
 
 from tiptrace.estimation.motion import Motions
 from tiptrace.estimation.pose_track import HandStates
-from tiptrace.estimation.tip_map import DRIFT, G_, C, TipMap
+from tiptrace.estimation.tip_map import TipMap
+from tiptrace.estimation.tip_map_config import DRIFT, G_, C
 from tiptrace.geometry.transforms import skew
 from tiptrace.types import FloatArray
 

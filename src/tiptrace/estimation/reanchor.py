@@ -13,7 +13,8 @@ from tiptrace.errors import GeometryError
 from tiptrace.estimation.observability import weak_axes
 from tiptrace.estimation.pads import PadMarkers
 from tiptrace.estimation.stage_one import Anchoring, StageOne
-from tiptrace.estimation.tip_map import P, TipMap
+from tiptrace.estimation.tip_map import TipMap
+from tiptrace.estimation.tip_map_config import P
 from tiptrace.geometry.transforms import rotation_log
 from tiptrace.types import FloatArray, SensedPair
 

@@ -12,12 +12,13 @@ from pydantic import BaseModel, ConfigDict, Field
 from tiptrace.errors import GeometryError
 from tiptrace.estimation.anchor import TipPrior, covariance_from_information
 from tiptrace.estimation.grasp_slips import GraspSlipConfig, Parts, only
-from tiptrace.estimation.integrity import Reference, reference
+from tiptrace.estimation.integrity_reference import Reference, reference
 from tiptrace.estimation.motion import MotionConfig, Motions, TemplateFit
 from tiptrace.estimation.pads import PadMarkers
 from tiptrace.estimation.patch import PatchConfig, trust
 from tiptrace.estimation.pose_track import HandStates, smooth_at
-from tiptrace.estimation.tip_map import DRIFT, TAU, C, TipMap, TipMapConfig, assumed_tip_map, solve_tip_map
+from tiptrace.estimation.tip_map import TipMap, assumed_tip_map, solve_tip_map
+from tiptrace.estimation.tip_map_config import DRIFT, TAU, C, TipMapConfig
 from tiptrace.geometry.transforms import skew
 from tiptrace.types import BoolArray, FloatArray, PoseSample
 

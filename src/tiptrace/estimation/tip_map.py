@@ -29,8 +29,6 @@ from tiptrace.estimation.tip_map_config import (
 from tiptrace.estimation.tip_map_solver import HandAt, Solution, Solver
 from tiptrace.types import AnchorChecks, BoolArray, FloatArray
 
-__all__ = ["DRIFT", "G_", "TAU", "C", "P", "TipMap", "TipMapConfig", "assumed_tip_map", "solve_tip_map"]
-
 
 @dataclass(frozen=True, slots=True)
 class TipMap:

@@ -26,10 +26,8 @@ _AREA = (0.4, 2.2)  # of the first frame's
 _INK = 0.45  # of the first frame's contrast
 _OFF_GRID = 0.38  # of the pitch: distance from where the neighbours say
 _STEADY = 0.3  # of the pitch: a dot that moved less since the frame before is the same dot for certain …
-_LEAPT, _DOUBT_FRAMES = (
-    0.1,
-    75,
-)  # … but for so many frames after one in which this share of all leapt: a pause
+_LEAPT = 0.1  # … unless so many of all leapt, as after a pause …
+_DOUBT_FRAMES = 75  # … within so many frames
 _SEARCH = 0.45  # of the pitch: how far from its predicted place a lost dot is looked for …
 _FOUND = 0.6  # … and may be found
 _MARGIN_PX = 1.0  # around a dot, where the network must not look either
