@@ -17,6 +17,7 @@ import pytest
 
 from tests.live.servers import Fault, Feed, MjpegServer, feed_from
 from tests.live.simulated import short_trial
+from tests.streams.helpers import ListStream
 from tiptrace.config import Rig
 from tiptrace.drivers.base import Closing, DeviceHealth, PoseFrames, RobotSample, RobotTap, Wake
 from tiptrace.drivers.opening import open_camera
@@ -31,7 +32,19 @@ from tiptrace.pipeline import open_tracer, steps
 from tiptrace.snapshot import Snapshot
 from tiptrace.streams.live import LiveStream, check_frames
 from tiptrace.streams.recording import Recording
-from tiptrace.types import SIDES, ImageSample, Phase, PhaseSample, PoseSample, Sample, Side, Status
+from tiptrace.types import (
+    SIDES,
+    FingerObservation,
+    Image,
+    ImageSample,
+    Observation,
+    Phase,
+    PhaseSample,
+    PoseSample,
+    Sample,
+    Side,
+    Status,
+)
 
 
 class FeedRobot(Closing):
@@ -75,6 +88,13 @@ class FeedRobot(Closing):
         self._stop.set()
 
 
+def rehearse(rig: Rig, references: dict[Side, Image]) -> None:
+    """Load what is slow the first time before the play begins."""
+    left, right = (FingerObservation(ImageSample(side, 0, references[side]), np.eye(4)) for side in SIDES)
+    with open_tracer(ListStream([], rig, references=references), "full") as tracer:
+        tracer.sensing(Observation(0, left, right))
+
+
 class Bench:
     """Servers, devices and a session on a short simulated trial."""
 
@@ -83,9 +103,11 @@ class Bench:
         out: Path | None = None,
         faults: tuple[Fault, ...] = (),
         silent: tuple[float, float] = (0.0, 0.0),
+        seconds: float = 2.0,
         **options: bool,
     ) -> None:
-        self.rig, references, samples = short_trial()
+        self.rig, references, samples = short_trial(seconds)
+        rehearse(self.rig, references)
         self.feed = feed_from(samples, offset_s=0.003)
         self.start, timeline = time.monotonic(), Timeline()
         self.servers = [MjpegServer(side, self.feed, self.start, faults) for side in SIDES]
@@ -123,16 +145,16 @@ class Shown:
                 yield sample
 
 
-def run_and_mark_after_a_second(path: Path) -> tuple[Bench, LiveSummary]:
-    """Six seconds; Stage I ends with the 25th pair."""
-    bench = Bench(path)
+def run_through_stage_one(path: Path) -> tuple[Bench, LiveSummary]:
+    """Stage I of 110 pairs, the images' way with and not against time, and two seconds more."""
+    bench = Bench(path, seconds=6.0)
 
     def mark(_: Snapshot) -> None:
-        if sum(s.latency_ms is not None for s in bench.seen) == 25:
+        if sum(s.latency_ms is not None for s in bench.seen) == 110:
             bench.session.advance()
 
     bench.session.subscribe(mark)
-    summary = bench.session.run(6.0)
+    summary = bench.session.run(6.4)
     bench.close()
     return bench, summary
 
@@ -143,7 +165,7 @@ def test_the_live_estimate_equals_the_offline_one_on_its_recording(
     monkeypatch.setattr("tiptrace.streams.live._ARRIVALS", 10_000)
     for attempt in range(3):
         path = tmp_path / f"live{attempt}.mcap"
-        bench, summary = run_and_mark_after_a_second(path)
+        bench, summary = run_through_stage_one(path)
         report = bench.session.report
         if (
             not report.pairs_without_pose and sum(report.unpaired.values()) <= 2
@@ -154,7 +176,7 @@ def test_the_live_estimate_equals_the_offline_one_on_its_recording(
     assert summary.pairs > 20
     assert summary.recorder is not None
     assert summary.recorder.error == ""
-    live = {s.estimate.stamp_ns: s.estimate for s in bench.seen if s.latency_ms is not None}
+    live = [s.estimate for s in bench.seen if s.latency_ms is not None]
     recording = Recording(path)
     assert recording.notes == []
     assert recording.trial["clock"]["offset_ns"] == bench.session.stream.timeline.offset_ns
@@ -162,10 +184,13 @@ def test_the_live_estimate_equals_the_offline_one_on_its_recording(
         recording, set(bench.session.stream._arrived)
     )  # a busy machine skips images that are recorded
     with open_tracer(shown, "full") as tracer:
-        offline = {s.estimate.stamp_ns: s.estimate for s in steps(shown, tracer)}
-    assert set(live) <= set(offline)
-    for stamp, a in live.items():
-        b = offline[stamp]
+        offline = [s.estimate for s in steps(shown, tracer)]
+    stamps_ns = np.array([b.stamp_ns for b in offline])
+    for a in live:
+        b = offline[int(np.abs(stamps_ns - a.stamp_ns).argmin())]
+        assert abs(a.stamp_ns - b.stamp_ns) < 1000, (
+            "a recording keeps rotations as quaternions: the latency moves"
+        )
         after_a_pause = (
             a.status is Status.DEGRADED and b.status is Status.OK
         )  # live marks what it saw go wrong
@@ -174,7 +199,8 @@ def test_the_live_estimate_equals_the_offline_one_on_its_recording(
         assert (a.p_B is None) == (b.p_B is None)
         if a.p_B is not None and b.p_B is not None:
             assert np.abs(a.p_B - b.p_B).max() < 1e-9, "a recording keeps rotations as quaternions"
-    assert {e.phase for e in live.values()} == {Phase.ANCHORING, Phase.RECONSTRUCTION}
+    assert sum(e.p_B is not None for e in live) > 20
+    assert {e.phase for e in live} == {Phase.ANCHORING, Phase.RECONSTRUCTION}
 
 
 def test_a_camera_that_stands_still_gives_no_estimate_and_says_so() -> None:
