@@ -14,8 +14,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tiptrace.errors import GeometryError
+from tiptrace.estimation.gauss_helmert_kernels import (
+    corrections,
+    fixed_point_rows,
+    normal_equations,
+    spurious,
+)
 from tiptrace.estimation.robust import annealed_limits, huber_weight, scale_from_median, tukey_weight
-from tiptrace.geometry.transforms import rotation_exp, skew
+from tiptrace.geometry.transforms import skew
 from tiptrace.types import FloatArray
 
 _UNKNOWN_M = 1.0  # a direction without information gets this standard deviation
@@ -154,7 +160,14 @@ class _Problem:
         default = np.diag([1e-3] * 6) ** 2
         Sigma = np.broadcast_to(default if covariance is None else np.asarray(covariance), (len(R), 6, 6))
         g = t if centre is None else np.broadcast_to(np.asarray(centre, dtype=np.float64), t.shape)
-        return cls(R, t, np.asarray(Sigma), np.asarray(g), prior, covariance is None)
+        return cls(
+            np.ascontiguousarray(R),
+            np.ascontiguousarray(t),
+            np.ascontiguousarray(Sigma),
+            np.ascontiguousarray(g),
+            prior,
+            covariance is None,
+        )
 
     def start(self) -> _State:
         """Least squares on ``R_t c + t_t = p``, a prior (or 10 m) holding what the data leave open."""
@@ -171,51 +184,35 @@ class _Problem:
 
     def _linearise(self, state: _State) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Jacobian A (T, 3, 6), S^{-1} (T, 3, 3), misclosure w (T, 3) at the corrected poses."""
-        c, p = state.theta[:3], state.theta[3:]
-        E = rotation_exp(state.delta[:, :3])  # (T, 3, 3)
-        R_hat = E @ self.R
-        lever = self.R @ c + self.t - self.centre  # (T, 3)
-        y = np.einsum("tij,tj->ti", E, lever) + self.centre + state.delta[:, 3:]
-        B = np.concatenate([-skew(y - self.centre), np.broadcast_to(np.eye(3), R_hat.shape)], axis=2)
-        S = B @ self.Sigma @ np.swapaxes(B, 1, 2)
-        A = np.concatenate([R_hat, np.broadcast_to(-np.eye(3), R_hat.shape)], axis=2)
-        w = y - p - np.einsum("tij,tj->ti", B, state.delta)
-        return A, np.linalg.inv(S), w
+        return fixed_point_rows(state.theta, state.delta, self.R, self.t, self.Sigma, self.centre)[:3]
 
     def step(self, state: _State, weights: FloatArray) -> _State:
         """One Gauss-Helmert step."""
-        A, S_inv, w = self._linearise(state)
-        WA = weights[:, None, None] * (S_inv @ A)  # (T, 3, 6)
-        N = np.einsum("tij,tik->jk", A, WA)
-        b = -np.einsum("tij,ti->j", WA, w)
+        A, S_inv, w, lever = fixed_point_rows(
+            state.theta, state.delta, self.R, self.t, self.Sigma, self.centre
+        )
+        N, b = normal_equations(A, S_inv, w, weights)
         if self.prior is not None:
             P = np.linalg.inv(self.prior.covariance)
             N[:3, :3] += P
             b[:3] += P @ (self.prior.c - state.theta[:3])
         N += max(1e-12 * float(np.trace(N)), 1e-9) * np.eye(6)
-        step = np.linalg.solve(N, b)
-        k = np.einsum("tij,tj->ti", S_inv, w + A @ step)  # (T, 3)
-        c = state.theta[:3]
-        lever = self.R @ c + self.t - self.centre
-        moment = np.cross(lever, k)  # Bᵀ k without forming B
-        delta = -np.einsum("tij,tj->ti", self.Sigma, np.concatenate([moment, k], axis=1))
+        step = np.asarray(np.linalg.solve(N, b), dtype=np.float64)
+        _, delta = corrections(A, S_inv, w, lever, self.Sigma, step)
         return _State(state.theta + step, delta, weights)
 
     def lengths(self, state: _State) -> FloatArray:
         """Whitened lengths of the misclosure ``R_t c + t_t − p``, (T,)."""
-        c, p = state.theta[:3], state.theta[3:]
-        y = self.R @ c + self.t
-        B = np.concatenate([-skew(y - self.centre), np.broadcast_to(np.eye(3), self.R.shape)], axis=2)
-        S = B @ self.Sigma @ np.swapaxes(B, 1, 2)
-        r = y - p
-        return np.asarray(np.sqrt(np.einsum("ti,tij,tj->t", r, np.linalg.inv(S), r)))
+        A, S_inv, w, lever = fixed_point_rows(
+            state.theta, np.zeros_like(state.delta), self.R, self.t, self.Sigma, self.centre
+        )
+        return corrections(A, S_inv, w, lever, self.Sigma, np.zeros(6))[0]
 
     def result(self, state: _State, scale: float) -> FixedPointML:
         """Estimate with its covariance; the noise of the rotations is not counted as motion."""
         c, p = state.theta[:3], state.theta[3:]
         A, S_inv, _ = self._linearise(state)
-        WA = state.weights[:, None, None] * (S_inv @ A)
-        N = np.einsum("tij,tik->jk", A, WA) / scale**2
+        N = normal_equations(A, S_inv, np.zeros((len(A), 3)), state.weights)[0] / scale**2
         N[:3, :3] -= self._spurious(state, S_inv)  # S and the rotation noise scale alike
         if self.prior is not None:
             N[:3, :3] += np.linalg.inv(self.prior.covariance)
@@ -225,14 +222,12 @@ class _Problem:
 
     def _spurious(self, state: _State, S_inv: FloatArray) -> FloatArray:
         """Information on c that mere rotation noise seems to carry, (3, 3)."""
-        K = skew(np.eye(3))  # (3, 3, 3): K[m] = [e_m]×
         lever = self.R @ state.theta[:3] + self.t - self.centre
         Sigma_w = self.Sigma[:, :3, :3]
         B = np.concatenate([-skew(lever), np.broadcast_to(np.eye(3), self.R.shape)], axis=2)
         gain = self.Sigma[:, :3] @ np.swapaxes(B, 1, 2)  # (T, 3, 3)
         posterior = Sigma_w - gain @ S_inv @ np.swapaxes(gain, 1, 2)
-        E = np.einsum("tmn,mki,tkl,nlj->tij", posterior, K, S_inv, K, optimize=True)  # mean of [δω]ᵀ S⁻¹ [δω]
-        return np.asarray(np.einsum("t,tki,tkl,tlj->ij", state.weights, self.R, E, self.R, optimize=True))
+        return spurious(np.ascontiguousarray(posterior), S_inv, self.R, state.weights)
 
 
 def covariance_from_information(N: FloatArray) -> FloatArray:

@@ -33,13 +33,15 @@ def _exp(w: FloatArray) -> FloatArray:
 @compiled
 def _log(A: FloatArray, B: FloatArray) -> tuple[float, float, float]:
     """Rotation vector of Aᵀ B, both (3, 3)."""
-    C = np.zeros((3, 3))
+    x, y, z, trace = 0.0, 0.0, 0.0, 0.0
     for i in range(3):
-        for j in range(3):
-            C[i, j] = A[0, i] * B[0, j] + A[1, i] * B[1, j] + A[2, i] * B[2, j]
-    x, y, z = 0.5 * (C[2, 1] - C[1, 2]), 0.5 * (C[0, 2] - C[2, 0]), 0.5 * (C[1, 0] - C[0, 1])
+        x += A[i, 2] * B[i, 1] - A[i, 1] * B[i, 2]
+        y += A[i, 0] * B[i, 2] - A[i, 2] * B[i, 0]
+        z += A[i, 1] * B[i, 0] - A[i, 0] * B[i, 1]
+        trace += A[i, 0] * B[i, 0] + A[i, 1] * B[i, 1] + A[i, 2] * B[i, 2]
+    x, y, z = 0.5 * x, 0.5 * y, 0.5 * z
     s2 = x * x + y * y + z * z
-    cosine = 0.5 * (C[0, 0] + C[1, 1] + C[2, 2] - 1.0)
+    cosine = 0.5 * (trace - 1.0)
     if s2 < 0.04 and cosine > 0.0:
         k = 1.0 + s2 / 6.0 + 0.075 * s2 * s2  # arcsin(s) / s
     else:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tiptrace.estimation.anchor import TipPrior, fixed_point_ml
+from tiptrace.estimation.gauss_helmert_kernels import corrections, linearise, normal_equations, spurious
 from tiptrace.estimation.information import residual_noise, scaled_inverse
 from tiptrace.estimation.motion import Motions
 from tiptrace.estimation.pose_track import HandStates
@@ -26,7 +27,6 @@ from tiptrace.estimation.tip_map_config import (
     TipMapConfig,
     map_prior,
 )
-from tiptrace.geometry.transforms import rotation_exp, skew
 from tiptrace.types import AnchorChecks, BoolArray, FloatArray, IntArray
 
 _MAP_CHANGE = 0.02  # of the map after a slip
@@ -84,6 +84,8 @@ class Solver:
         self._steps = np.zeros((len(phase), 0)) if steps is None else steps
         self.size: int = SIZE + 3 * self._steps.shape[1]
         self._m, self._hand_at, self._phase, self._config = motions, hand_at, phase, config
+        self._shares = np.column_stack([phase, self._steps])  # (T, 1 + K) of drift and steps in c_t
+        self._read: tuple[float, HandStates] | None = None
         self._latency, self._prior = latency, prior
         self._mean = np.concatenate([np.zeros(6), I9, [latency[0]], np.zeros(self.size - 16)])
         self._prior_P = np.zeros((self.size, self.size))  # of what has a prior; c and p have none here
@@ -126,7 +128,7 @@ class Solver:
 
     def start(self) -> FloatArray:
         """Maximum likelihood with the gel taken at its word and the latency at its prior."""
-        T = self._hand_at(self._latency[0]).T_B_E
+        T = self._hand(self._latency[0]).T_B_E
         R_BE = T[:, :3, :3]
         rotate = np.zeros((len(T), 6, 6))
         rotate[:, :3, :3] = rotate[:, 3:, 3:] = R_BE
@@ -146,33 +148,26 @@ class Solver:
 
     def moved(self, theta: FloatArray) -> FloatArray:
         """Standard deviation of the enforced motion along each axis of F_E, (3,) m."""
-        T = self._hand_at(float(theta[15])).T_B_E
+        T = self._hand(float(theta[15])).T_B_E
         u = np.einsum("tji,tj->ti", T[:, :3, :3], theta[P] - T[:, :3, 3])
         return np.asarray(u.std(axis=0))
 
     def solve(self, theta: FloatArray, free: BoolArray) -> Solution:
         """Gauss-Helmert iterations over the free unknowns; the others stay at their prior."""
         theta = np.where(free, theta, self._mean)
-        k = np.zeros((len(self._phase), 3))
         delta = np.zeros((len(self._phase), 6))
         weights = np.ones(len(self._phase))
         index = np.flatnonzero(free)
         for iteration in range(self._config.iterations):
             A, S_inv, w, lever = self._linearise(theta, delta)
-            WA = weights[:, None, None] * (S_inv @ A)
-            N = np.einsum("tij,tik->jk", A, WA, optimize=True) + self._prior_N
-            b = -np.einsum("tij,ti->j", WA, w) + self._prior_N @ (self._mean - theta)
+            N, b = normal_equations(A, S_inv, w, weights)
+            N, b = N + self._prior_N, b + self._prior_N @ (self._mean - theta)
             N_ff = N[np.ix_(index, index)]
             step = np.zeros(self.size)
             step[index] = np.linalg.solve(N_ff + 1e-12 * np.diag(np.diag(N_ff)), b[index])
-            misfit = w + A @ step
-            k = np.einsum("tij,tj->ti", S_inv, misfit)
-            length = np.sqrt(np.maximum(np.einsum("ti,ti->t", misfit, k), 0.0))
+            length, delta = corrections(A, S_inv, w, lever, self._m.covariance, step)
             scale = max(1.0, scale_from_median(length))
             weights = tukey_weight(length, max(self._config.outlier, 20.0 * 0.7**iteration) * scale)
-            delta = -np.einsum(
-                "tij,tj->ti", self._m.covariance, np.concatenate([np.cross(lever, k), k], axis=1)
-            )
             theta = theta + step
             if iteration > 4 and np.abs(step[:6]).max() < 1e-6:
                 break
@@ -182,33 +177,27 @@ class Solver:
         self, theta: FloatArray, delta: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """A (T, 3, 19), S⁻¹ (T, 3, 3), misclosure (T, 3), lever (T, 3) at the corrected motions."""
-        m, T = self._m, len(self._phase)
-        p, G, tau = theta[P], theta[G_].reshape(3, 3), float(theta[15])
-        shares = np.column_stack([self._phase, self._steps])  # (T, 1 + K)
-        c_t = theta[C] + shares @ theta[16:].reshape(-1, 3)  # (T, 3)
-        hand = self._hand_at(tau)
-        R_BE, t_BE = hand.T_B_E[:, :3, :3], hand.T_B_E[:, :3, 3]
-        q = np.einsum("tji,tj->ti", R_BE, p - t_BE)  # resting tip in F_E
-        u = q - c_t
-        du_ds = -np.cross(hand.rate_E, q) - np.einsum("tji,tj->ti", R_BE, hand.velocity_B)
-        E = rotation_exp(delta[:, :3])
-        R = E @ m.R
-        lever_0 = np.einsum("tij,tj->ti", m.R, c_t) + m.t - m.centre
-        lever = np.einsum("tij,tj->ti", E, lever_0)
-        y = lever + m.centre + delta[:, 3:]
-        B = np.concatenate([-skew(lever), np.broadcast_to(np.eye(3), (T, 3, 3))], axis=2)
-        S = B @ m.covariance @ np.swapaxes(B, 1, 2)
-        S[:, range(3), range(3)] += self._config.pose_sigma_m**2 + self._config.model_sigma_m**2
-        A = np.zeros((T, 3, self.size))
-        A[:, :, C] = R - np.eye(3) + G
-        A[:, :, P] = -G @ np.swapaxes(R_BE, 1, 2)
-        for j in range(3):
-            A[:, j, 6 + 3 * j : 9 + 3 * j] = -u
-        A[:, :, 15] = du_ds @ G.T
-        for k, part in enumerate(self._moving):
-            A[:, :, part] = shares[:, k, None, None] * A[:, :, C]
-        r = y - c_t - u @ G.T
-        return A, np.linalg.inv(S), r - np.einsum("tij,tj->ti", B, delta), lever
+        m, hand = self._m, self._hand(float(theta[15]))
+        variance = self._config.pose_sigma_m**2 + self._config.model_sigma_m**2
+        return linearise(
+            theta,
+            delta,
+            hand.T_B_E,
+            hand.velocity_B,
+            hand.rate_E,
+            m.R,
+            m.t,
+            m.centre,
+            m.covariance,
+            self._shares,
+            variance,
+        )
+
+    def _hand(self, latency_s: float) -> HandStates:
+        """The hand for a latency; reading it costs as much as all other equations, so the last one is kept."""
+        if self._read is None or self._read[0] != latency_s:
+            self._read = (latency_s, self._hand_at(latency_s))
+        return self._read[1]
 
     def _finish(self, theta: FloatArray, free: BoolArray, delta: FloatArray, weights: FloatArray) -> Solution:
         """Covariance with correlated residuals, rotation noise not counted as motion, gates' priors kept."""
@@ -218,8 +207,8 @@ class Solver:
         variance, correlation = residual_noise(r[rested], S_inv[rested])
         noise = max(variance, self._config.least_noise)
         correlated = max(1.0, variance * correlation)
-        N = np.einsum("tij,tik->jk", A, weights[:, None, None] * (S_inv @ A), optimize=True)
-        N[C, C] -= self._spurious(S_inv, weights)
+        N, _ = normal_equations(A, S_inv, r, weights)
+        N[C, C] -= spurious(np.ascontiguousarray(self._m.covariance[:, :3, :3]), S_inv, self._m.R, weights)
         covariance = self._covariance(N / (noise * correlation), free)
         cautious = self._covariance(N / max(correlated, noise * correlation), free)
         for part in (TAU, DRIFT):  # gels lag, and creep is no straight line: no less than assumed
@@ -288,20 +277,14 @@ class Solver:
         block: slice = P,
     ) -> tuple[FloatArray, FloatArray]:
         """From the solution to that of some frames alone, without the tip's prior: (19,), and a (3, 3) covariance."""
-        W = (part * best.weights)[:, None, None] * S_inv
         prior = self._prior_N.copy()
         prior[C, C] = np.eye(3)  # 1 m
-        N = (np.einsum("tij,tik->jk", A, W @ A, optimize=True) + prior)[np.ix_(free, free)]
-        b = -np.einsum("tij,tik,tk->j", A, W, w, optimize=True) + self._prior_N @ (self._mean - best.theta)
-        b[C] = -np.einsum("tij,tik,tk->j", A[:, :, C], W, w, optimize=True)
+        N, b = normal_equations(A, S_inv, w, part * best.weights)
+        own = b[C].copy()
+        N, b = (N + prior)[np.ix_(free, free)], b + self._prior_N @ (self._mean - best.theta)
+        b[C] = own
         inverse = scaled_inverse(N)
         step = np.zeros(self.size)
         step[free] = inverse @ b[free]
         here = np.flatnonzero(np.isin(free, np.arange(self.size)[block]))
         return step, inverse[np.ix_(here, here)]
-
-    def _spurious(self, S_inv: FloatArray, weights: FloatArray) -> FloatArray:
-        """Information on c that mere rotation noise seems to carry, (3, 3)."""
-        K = skew(np.eye(3))
-        E = np.einsum("tmn,mki,tkl,nlj->tij", self._m.covariance[:, :3, :3], K, S_inv, K, optimize=True)
-        return np.asarray(np.einsum("t,tki,tkl,tlj->ij", weights, self._m.R, E, self._m.R, optimize=True))
