@@ -74,6 +74,21 @@ def test_full_refuses_the_anchor_and_names_the_arrangement(pairs: list[SensedPai
     assert sentence in refused.detail
 
 
+def test_nobody_is_blamed_where_the_tip_rests_under_no_arrangement(pairs: list[SensedPair]) -> None:
+    def adrift(pair: SensedPair) -> SensedPair:
+        """The tool sways in the grasp by 2 mm, each pad its way."""
+        t_s = (pair.stamp_ns - pairs[0].stamp_ns) * 1e-9
+        sway = 2e-3 * np.array([np.sin(2.3 * t_s), np.sin(3.1 * t_s), 0.0])
+        x_S = [f.markers.x_S + sign * sway for f, sign in ((pair.left, 1), (pair.right, -1))]
+        left, right = (
+            replace(f, markers=replace(f.markers, x_S=x))
+            for f, x in zip((pair.left, pair.right), x_S, strict=True)
+        )
+        return replace(pair, left=left, right=right)
+
+    run(pairs, lambda pair: exchanged(adrift(pair)))
+
+
 def test_full_takes_the_right_arrangement(pairs: list[SensedPair]) -> None:
     estimator = FullEstimator()
     for pair in pairs:

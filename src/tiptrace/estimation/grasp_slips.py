@@ -6,7 +6,7 @@ template of its own, and the tip a place of its own in it. The tip rests all the
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
 
@@ -15,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from tiptrace.estimation.integrity_reference import Reference, reference
 from tiptrace.estimation.motion import MotionConfig, Motions, TemplateFit
+from tiptrace.estimation.tip_map import TipMap
 from tiptrace.types import BoolArray, FloatArray
 
 
@@ -28,9 +29,9 @@ class GraspSlipConfig(BaseModel):
     pattern_m: float = Field(default=8e-5, gt=0)  # rms over the markers and frames that it explains
     relief: float = Field(
         default=0.6, gt=0, le=1
-    )  # the first slip brings the inflation down by at least this
+    )  # the first slip, and one that the pattern does not show, bring the unrest down by at least this
     most: int = Field(
-        default=3, ge=0
+        default=4, ge=0
     )  # slips sought in Stage I; 0: such a Stage I keeps its large covariance
     least_frames: int = Field(default=10, ge=5)  # between slips
 
@@ -92,6 +93,12 @@ class Parts:
         rms = np.sqrt(gain / max(int(seen[..., 0].sum()), 1))
         return at if gain > config.share * total and rms > config.pattern_m else None
 
+    def jump(self, residual: FloatArray, config: GraspSlipConfig) -> int | None:
+        """First frame after the likeliest jump of the resting tip's residuals (T, 3); None between too few frames."""
+        found = [_best_cut(residual[a:b, None], a, config.least_frames) for a, b in pairwise(self._bounds)]
+        gain, at = max(found)
+        return at if gain > 0.0 else None
+
     def cut_at(self, frame: int, motion: MotionConfig, rounds: int = 2) -> Parts:
         """The same with one slip more."""
         cuts = sorted((*self.cuts, frame))
@@ -107,6 +114,54 @@ class Parts:
             fits.append(fit)
             parts.append(own)
         return Parts(fits, parts, cuts, self.X)
+
+
+def through_slips(
+    parts: Parts, solution: Callable[[Parts], TipMap], motion: MotionConfig, config: GraspSlipConfig
+) -> tuple[Parts, TipMap]:
+    """Cut Stage I at slips for as long as that makes the tip rest.
+
+    A slip shows in the markers' pattern about their rigid fit. One that turns all of them alike does not, and is taken
+    from the tip's own residuals, which then have to become far smaller.
+
+    Args:
+        parts: Stage I in one.
+        solution: Solves for the tip with given parts.
+        motion: Of the fits.
+        config: When a slip is believed.
+    """
+    tip_map = solution(parts)
+    first = tip_map.unrest
+    if first < config.suspicion:
+        return parts, tip_map
+    while len(parts.cuts) < config.most:
+        tries = [(parts.next_cut(config), tip_map.unrest if parts.cuts else config.relief * first)]
+        if tip_map.unrest > config.suspicion:
+            tries.append((parts.jump(tip_map.residual, config), config.relief * tip_map.unrest))
+        found = _first_relief(parts, solution, motion, tries)
+        if found is None:
+            break
+        parts, tip_map = found
+    if parts.cuts:  # slips explain too much at times: no surer than the root of what was unexplained
+        tip_map = tip_map.inflated(np.sqrt(first) / tip_map.unrest)
+    return parts, tip_map
+
+
+def _first_relief(
+    parts: Parts,
+    solution: Callable[[Parts], TipMap],
+    motion: MotionConfig,
+    tries: Sequence[tuple[int | None, float]],
+) -> tuple[Parts, TipMap] | None:
+    """Of (frame, largest unrest) the first cut after which the tip rests so well."""
+    for at, limit in tries:
+        if at is None:
+            continue
+        further = parts.cut_at(at, motion)
+        tip_map = solution(further)
+        if tip_map.unrest <= limit:
+            return further, tip_map
+    return None
 
 
 def _in_plane(fit: TemplateFit, X: FloatArray, m: Motions) -> FloatArray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from copy import copy, deepcopy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from tiptrace.errors import GeometryError
 from tiptrace.estimation.anchor import TipPrior, covariance_from_information
-from tiptrace.estimation.grasp_slips import GraspSlipConfig, Parts, only
+from tiptrace.estimation.grasp_slips import GraspSlipConfig, Parts, only, through_slips
 from tiptrace.estimation.integrity_reference import Reference, reference
 from tiptrace.estimation.motion import MotionConfig, Motions, TemplateFit
 from tiptrace.estimation.pads import PadMarkers
@@ -96,6 +96,7 @@ class StageOne:
         self._sum_S: FloatArray | None = None
         self._seen: FloatArray | None = None
         self._count = 0
+        self._fitted: tuple[FloatArray, FloatArray, TemplateFit, FloatArray, Motions] | None = None
 
     def __len__(self) -> int:
         return self._count
@@ -143,7 +144,7 @@ class StageOne:
         Raises:
             GeometryError: too few frames, markers or poses.
         """
-        stamps, X, fit, weights, motions = self._fit_template()
+        stamps, X, fit, weights, motions = self._fitted or self._fit_template()
         duration = max((stamps[-1] - stamps[0]) * 1e-9, 1e-3)
         good: BoolArray = motions.sides[:, 0] * motions.sides[:, 1] > 0
         if good.sum() < 3:
@@ -172,28 +173,12 @@ class StageOne:
                 p.steps,
             )
 
-        parts, tip_map = self._through_slips(Parts([fit], [only(motions, good)], [], X), solution)
+        whole = Parts([fit], [only(motions, good)], [], X)
+        parts, tip_map = through_slips(whole, solution, self._motion, self._config.slips)
         ref = parts.reference(tip_map.c, self._normal)
         hand = hand_at(tip_map.latency_s)
         slips = tuple((int(kept[k - 1]), int(kept[k])) for k in parts.cuts)
         return Anchoring(tip_map, parts.last, weights, kept, parts.motions, hand, ref, int(stamps[0]), slips)
-
-    def _through_slips(self, parts: Parts, solution: Callable[[Parts], TipMap]) -> tuple[Parts, TipMap]:
-        """Where residuals hang together and the markers' pattern changes, the tool slipped: cut there."""
-        c, tip_map = self._config.slips, solution(parts)
-        if tip_map.unrest < c.suspicion:
-            return parts, tip_map
-        first = tip_map.unrest
-        while len(parts.cuts) < c.most:
-            at = parts.next_cut(c)
-            if at is None:
-                break
-            further = parts.cut_at(at, self._motion)
-            better = solution(further)
-            if better.unrest > (c.relief * first if not parts.cuts else tip_map.unrest):
-                break
-            parts, tip_map = further, better
-        return parts, tip_map
 
     def assume(self, tip: TipPrior, latency: tuple[float, float] | None) -> Anchoring:
         """Stand-in for Stage I with a tip from elsewhere: the first frames only give the template."""
@@ -218,6 +203,17 @@ class StageOne:
         """An empty segment with the same settings in which no slips are sought: in mid-trial they are watched for."""
         still = self._config.model_copy(update={"slips": self._config.slips.model_copy(update={"most": 0})})
         return StageOne(still, self._patch, self._motion, self._tip_map, self._half_s)
+
+    def copy(self) -> StageOne:
+        """The segment as it is now, to be solved later; nothing is added to a copy."""
+        other = copy(self)
+        other._frames, other._poses = self._frames.copy(), self._poses.copy()
+        other._sum_S, other._seen = deepcopy((self._sum_S, self._seen))
+        return other
+
+    def prepare(self) -> None:
+        """Fit a copy's template, so that its solves have less to do."""
+        self._fitted = self._fit_template()
 
     def keep_from(self, stamp_ns: int) -> None:
         """Forget frames and poses before an instant."""

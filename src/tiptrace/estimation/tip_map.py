@@ -8,7 +8,7 @@ correction, eliminated frame by frame (Gauss-Helmert), so that noisy rotations d
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -90,6 +90,10 @@ class TipMap:
         """(3,) displacement of the tip in the grasp over the length of Stage I, m."""
         return self.theta[DRIFT]
 
+    def inflated(self, factor: float) -> TipMap:
+        """The same with a covariance larger by a factor, where that is above 1."""
+        return replace(self, covariance=max(1.0, factor) * self.covariance)
+
 
 def solve_tip_map(
     motions: Motions,
@@ -122,15 +126,36 @@ def solve_tip_map(
     """
     normal = np.array([1.0, 0.0, 0.0]) if normal_E is None else normal_E
     latency = latency or (config.latency_s, config.latency_std_s)
-    solver = Solver(motions, hand_at, phase, config, latency, prior, normal, steps)
-    if known is not None:
-        solver.expect_map(known.G, known.covariance[G_, G_])
+
+    def make_solver(noise: float) -> Solver:
+        """With frames of so many times the assumed variance."""
+        sigma = {name: noise**0.5 * getattr(config, name) for name in ("pose_sigma_m", "model_sigma_m")}
+        made = Solver(
+            replace(motions, covariance=noise * motions.covariance),
+            hand_at,
+            phase,
+            config.model_copy(update=sigma),
+            latency,
+            prior,
+            normal,
+            steps,
+        )
+        if known is not None:
+            made.expect_map(known.G, known.covariance[G_, G_])
+        return made
+
+    solver = make_solver(1.0)
     theta = solver.start()
     free = np.ones(solver.size, dtype=bool)
     free[DRIFT] = False
     learned_column = solver.moved(theta) > config.map_gate_m
     free[G_] = (np.tile(learned_column, 3) | DIAGONAL) & config.learn_map & bool(learned_column.any())
     best = solver.solve(theta, free)
+    rougher = 1.0
+    if solver.map_is_absurd(best) and best.factor > 1.0:  # a tip that did not rest must not bend the map
+        rougher = best.factor
+        solver = make_solver(rougher)
+        best = solver.solve(theta, free)
     if solver.map_is_absurd(best):
         free[G_] = False
         best = solver.solve(theta, free)
@@ -152,13 +177,13 @@ def solve_tip_map(
         best.covariance[:SIZE, :SIZE],
         best.learned[:SIZE],
         best.rms,
-        best.factor,
+        rougher * best.factor,
         len(phase),
         duration_s,
         best.r,
         solver.checks(best),
         float(np.mean(best.weights > 0.1)),
-        best.noise,
+        rougher * best.noise,
     )
 
 
