@@ -73,6 +73,15 @@ class Sensing:
         left, right = self._both(lambda side: self._sense(side, observation), SIDES)
         return SensedPair(observation.stamp_ns, observation.phase, left, right, observation.poses)
 
+    def prepare(self) -> None:
+        """Set up both fingers before images come, so that the first one does not wait for that.
+
+        Raises:
+            PerceptionError: a reference or gel model that cannot be used.
+        """
+        for side in SIDES:
+            self._finger(side)
+
     def _sense(self, side: Side, observation: Observation) -> SensedFinger:
         seen = observation.finger(side)
         if isinstance(seen.sample, ImageSample):

@@ -77,7 +77,9 @@ class Feed:
 
     def poses_at(self, rate_hz: float) -> list[bytes]:
         """Position and rotation vector one way through the trial, as six big-endian doubles each."""
-        s = np.clip(np.arange(round(self.duration_s * rate_hz) + 1) / rate_hz, self.pose_s[0], self.pose_s[-1])
+        s = np.clip(
+            np.arange(round(self.duration_s * rate_hz) + 1) / rate_hz, self.pose_s[0], self.pose_s[-1]
+        )
         k = np.clip(np.searchsorted(self.pose_s, s) - 1, 0, len(self.pose_s) - 2)
         u = (s - self.pose_s[k]) / (self.pose_s[k + 1] - self.pose_s[k])
         T = interpolate_screw(self.T_B_E[k], self.T_B_E[k + 1], u)
@@ -288,7 +290,9 @@ class RtdeServer(_Playing):
         port: int = 30004,
     ) -> None:
         self._opening_m, self._base_change_s = opening_m, base_change_s
-        self._poses = feed.poses_at(RTDE_HZ)  # worked out before, so that the server takes little of the machine
+        self._poses = feed.poses_at(
+            RTDE_HZ
+        )  # worked out before, so that the server takes little of the machine
         super().__init__("robot", feed, start, faults, port)
 
     def handle(self, connection: socket.socket) -> None:

@@ -131,6 +131,10 @@ class FullEstimator:
             return TipEstimate(self._exposure_ns(pair.stamp_ns), phase, Status.LOST)
         return self._stage_two_step(replace(pair, phase=phase, poses=poses), markers, repeated)
 
+    def use_pause(self) -> None:
+        """Do some of what no estimate waits for, between two pairs; estimates do not depend on it."""
+        self._reanchoring.advance()
+
     def _found_phase(self, pair: SensedPair) -> Phase:
         """Where no marks tell it; without a Stage I all is Stage II."""
         return self._phases.update(pair.stamp_ns, pair.left.T_B_E) if self._staged else Phase.RECONSTRUCTION
@@ -238,7 +242,10 @@ class FullEstimator:
         if pair.stamp_ns - self._last_ns > self._config.integrity.pause_s * 1e9:
             self._monitor.resume()
         self._last_ns = pair.stamp_ns
-        status, extra = self._verdict.of(stamp_ns, self._judge(markers, motions, hand, repeated))
+        findings = self._judge(markers, motions, hand, repeated)
+        if findings.slipping:
+            self._reanchoring.abandon()
+        status, extra = self._verdict.of(stamp_ns, findings)
         self._report_step(pair.stamp_ns, motions, hand, extra)
         R_B_E = hand.T_B_E[0, :3, :3] @ motions.R[0]
         estimate = replace(estimate, status=status, R_B_E=R_B_E, residual_m=float(motions.residual_m[0]))

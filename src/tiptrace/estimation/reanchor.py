@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,6 +34,7 @@ class ReanchorConfig(BaseModel):
         default=1e-3, gt=0
     )  # of the new anchor on any axis; waits for more motion until then
     every: int = Field(default=12, ge=1)  # frames between attempts
+    later: int = Field(default=3, ge=1)  # frames after which an attempt's result is taken
     latency_std_s: float = Field(default=0.02, gt=0)  # by which the time offset may have changed
     latency_sigmas: float = Field(default=4.0, gt=0)  # a change beyond is told
     latency_change_s: float = Field(default=0.010, gt=0)
@@ -69,14 +71,77 @@ class Renewed:
     latency_change_s: float | None
 
 
+class _Attempt:
+    """The anchor of a window as it was when the attempt began, worked out part by part."""
+
+    def __init__(self, config: ReanchorConfig, window: StageOne, p_B: FloatArray, known: TipMap) -> None:
+        self.here, self.known, self.age = np.median(p_B, axis=0), known, 0
+        self._config, self._window = config, window
+        self._parts = self._solve()
+        self._anchoring: Anchoring | None = None
+
+    def advance(self) -> bool:
+        """Do one part; whether there was one."""
+        try:
+            next(self._parts)
+        except (StopIteration, GeometryError, np.linalg.LinAlgError):
+            return False
+        return True
+
+    def result(self) -> Anchoring | None:
+        """The window's anchor, None where it is too vague; does what is left."""
+        while self.advance():
+            pass
+        return self._anchoring
+
+    def _solve(self) -> Iterator[None]:
+        """What creeps in a short window looks like another time offset: unless that is certain, the old one holds."""
+        c, known = self._config, self.known
+        self._window.prepare()
+        yield
+        anchoring = self._window.solve((known.latency_s, c.latency_std_s), None, known)
+        if weak_axes(anchoring.tip_map.covariance[P, P], c.sigma_m):
+            return
+        if latency_change(anchoring.tip_map, known, c) is None:
+            yield
+            anchoring = self._window.solve((known.latency_s, c.latency_held_s), None, known)
+            if weak_axes(anchoring.tip_map.covariance[P, P], c.sigma_m):
+                return
+        self._anchoring = anchoring
+
+
+def latency_change(now: TipMap, before: TipMap, c: ReanchorConfig) -> float | None:
+    """New latency less the old one, s, where they differ for certain."""
+    change = now.latency_s - before.latency_s
+    own = float(np.sqrt(now.covariance[15, 15]))
+    sigma = math.hypot(own, float(np.sqrt(before.covariance[15, 15])))
+    certain = abs(change) > max(c.latency_sigmas * sigma, c.latency_change_s)
+    sure = own < c.latency_sigma_s and abs(change) < c.latency_most_s
+    return change if certain and sure and bool(now.learned[15]) else None
+
+
 class Reanchoring:
-    """Watches the last seconds; bounded memory."""
+    """Watches the last seconds; bounded memory.
+
+    An attempt takes as long as several frames do. Its result is taken a few frames after it began, whether it was
+    worked out meanwhile, by :meth:`advance` between the frames, or not: so it does not depend on anybody's time.
+    """
 
     def __init__(self, config: ReanchorConfig, like: StageOne) -> None:
         self._config, self._like = config, like
         self._segment = like.fresh()
         self._rows: deque[_Row] = deque()
         self._count = 0
+        self._attempt: _Attempt | None = None
+
+    def advance(self) -> None:
+        """Do a part of what is pending."""
+        if self._attempt is not None:
+            self._attempt.advance()
+
+    def abandon(self) -> None:
+        """The tool slipped: what is pending belongs to the grasp before."""
+        self._attempt = None
 
     def update(
         self, pair: SensedPair, markers: PadMarkers, p_B: FloatArray, R_B_E: FloatArray, known: TipMap
@@ -87,50 +152,34 @@ class Reanchoring:
         self._rows.append(_Row(pair.stamp_ns, p_B, R_B_E))
         self._forget(pair.stamp_ns - round(self._config.window_s * 1e9))
         self._count += 1
-        if self._count % self._config.every or not self._rests(pair.stamp_ns):
-            return None
-        anchoring = self._solved(known)
+        if self._attempt is not None:
+            self._attempt.age += 1
+            return self._renewed(self._attempt) if self._attempt.age >= self._config.later else None
+        if self._count % self._config.every == 0 and self._rests(pair.stamp_ns):
+            p = np.stack([r.p_B for r in self._rows])
+            self._attempt = _Attempt(self._config, self._segment.copy(), p, known)
+        return None
+
+    def _renewed(self, attempt: _Attempt) -> Renewed | None:
+        """The end of an attempt; after a new anchor the window begins anew."""
+        self._attempt, anchoring = None, attempt.result()
         if anchoring is None:
             return None
-        tip_map = anchoring.tip_map
-        off = np.median(np.stack([r.p_B for r in self._rows]), axis=0) - tip_map.p
+        tip_map, known = anchoring.tip_map, attempt.known
+        off = attempt.here - tip_map.p
         self._segment, self._count = self._like.fresh(), 0
         self._rows.clear()
         return Renewed(
             anchoring,
             float(np.linalg.norm(off)),
             self._contradicts(off, tip_map, known),
-            self._latency_change(tip_map, known),
+            latency_change(tip_map, known, self._config),
         )
-
-    def _solved(self, known: TipMap) -> Anchoring | None:
-        """The window's anchor, None while it is too vague.
-
-        What creeps in a short window looks like another time offset: unless that is certain, the old one holds.
-        """
-        c = self._config
-        try:
-            anchoring = self._segment.solve((known.latency_s, c.latency_std_s), None, known)
-            if weak_axes(anchoring.tip_map.covariance[P, P], c.sigma_m):
-                return None
-            if self._latency_change(anchoring.tip_map, known) is None:
-                anchoring = self._segment.solve((known.latency_s, c.latency_held_s), None, known)
-        except (GeometryError, np.linalg.LinAlgError):
-            return None
-        return None if weak_axes(anchoring.tip_map.covariance[P, P], c.sigma_m) else anchoring
 
     def _contradicts(self, off: FloatArray, now: TipMap, before: TipMap) -> bool:
         """Whether both anchors cannot be right, by the distance (3,) of the trace from where the tip rests."""
         covariance = now.covariance[P, P] + before.covariance[P, P] + self._config.slack_m**2 * np.eye(3)
         return bool(off @ np.linalg.solve(covariance, off) > self._config.contradiction)
-
-    def _latency_change(self, now: TipMap, before: TipMap) -> float | None:
-        change = now.latency_s - before.latency_s
-        own = float(np.sqrt(now.covariance[15, 15]))
-        sigma = math.hypot(own, float(np.sqrt(before.covariance[15, 15])))
-        certain = abs(change) > max(self._config.latency_sigmas * sigma, self._config.latency_change_s)
-        sure = own < self._config.latency_sigma_s and abs(change) < self._config.latency_most_s
-        return change if certain and sure and bool(now.learned[15]) else None
 
     def _forget(self, stamp_ns: int) -> None:
         while self._rows[0].stamp_ns < stamp_ns:

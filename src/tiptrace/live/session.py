@@ -12,6 +12,7 @@ import numpy as np
 
 from tiptrace.drivers.base import DeviceHealth, DeviceStatus
 from tiptrace.errors import PerceptionError
+from tiptrace.estimation.full import FullEstimator
 from tiptrace.live.monitor import StageOneMonitor, StageOneView
 from tiptrace.live.phases import PhaseMarker
 from tiptrace.live.recorder import Recorder
@@ -130,6 +131,8 @@ class LiveSession:
             if self.recorder is not None:
                 stack.enter_context(self.recorder)
             tracer = stack.enter_context(open_tracer(self.stream, self.method))
+            if self.stream.first_images:
+                tracer.sensing.prepare()
             stack.enter_context(_no_sweeps())
             if not self.stream.standby:
                 self.stream.begin()
@@ -141,6 +144,8 @@ class LiveSession:
             for step in steps(self.stream, tracer, self.report, self.stream.settings, self._bad_pair):
                 self.stage_one = monitor.update(step.estimate)
                 self._show(step)
+                if isinstance(tracer.estimator, FullEstimator):
+                    tracer.estimator.use_pause()
         return self.summary()
 
     def summary(self) -> LiveSummary:
