@@ -15,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from tiptrace.estimation.integrity_reference import Reference, reference
 from tiptrace.estimation.motion import MotionConfig, Motions, TemplateFit
+from tiptrace.estimation.slip_detector import SlipLevels
 from tiptrace.estimation.tip_map import TipMap
 from tiptrace.types import BoolArray, FloatArray
 
@@ -60,13 +61,17 @@ class Parts:
         return self.fits[-1]
 
     def reference(self, c_E: FloatArray, normal_E: FloatArray) -> Reference:
-        """What Stage I showed: its range from all frames, the markers' pattern since the last slip."""
+        """What Stage I showed: range and unrest from all frames, the markers' pattern since the last slip."""
         whole = reference(self.last, self.X, self.motions, c_E, normal_E)
         if not self.cuts:
             return whole
-        rows = slice(self.cuts[-1], len(self.X))
-        now = reference(self.last, self.X[rows], only(self.motions, rows), c_E, normal_E)
-        return replace(now, axial_m=whole.axial_m, start_E=whole.start_E)
+        rows = [slice(a, b) for a, b in pairwise(self._bounds)]
+        each = [
+            reference(fit, self.X[r], only(self.motions, r), c_E, normal_E)
+            for fit, r in zip(self.fits, rows, strict=True)
+        ]
+        slip = SlipLevels(max(r.slip.kick_m for r in each), max(r.slip.pattern_m for r in each))
+        return replace(each[-1], axial_m=whole.axial_m, start_E=whole.start_E, slip=slip)
 
     @property
     def steps(self) -> FloatArray | None:
