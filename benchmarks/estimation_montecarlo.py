@@ -68,6 +68,20 @@ def nees_counts(trajectory: TipTrajectory, t: Trial) -> list[int]:
     return np.histogram(nees[np.isfinite(nees)], [*NEES_EDGES, np.inf])[0].tolist()
 
 
+def slips_told(trajectory: TipTrajectory, t: Trial) -> dict[str, int]:
+    """Told slips: in Stage I, where the tool broke away (0.05 mm or 0.5° within a second either side), and neither."""
+    exposed = t.exposure_ns[: len(t.slip_m)]
+    start = next((e.stamp_ns for e in trajectory.estimates if e.phase is Phase.RECONSTRUCTION), exposed[-1])
+    counts = dict.fromkeys(("stage I", "broke away", "neither"), 0)
+    for event in trajectory.events:
+        if event.kind != "grasp-slip":
+            continue
+        near = np.abs(exposed - event.start_ns) < 1_000_000_000
+        broke = near.any() and (np.ptp(t.slip_m[near]) > 5e-5 or np.ptp(t.slip_deg[near]) > 0.5)
+        counts["stage I" if event.start_ns < start else "broke away" if broke else "neither"] += 1
+    return counts
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--level", default="nominal")
@@ -98,6 +112,7 @@ def main() -> None:
             row["verdict"] = assess(trajectory).verdict
             row["prior_mm"] = float(np.linalg.norm(t.nominal_error_m)) * 1e3
             row["events"] = ",".join(e.kind for e in trajectory.events)
+            row["slips"] = slips_told(trajectory, t)
             row["minutes"] = (t.pairs[-1].stamp_ns - t.pairs[0].stamp_ns) / 6e10
             rows[method].append(row)
     report(args, rows)
@@ -131,6 +146,9 @@ def report(args: argparse.Namespace, rows: dict[str, list[dict[str, Any]]]) -> N
         told = [kind for r in rows["full"] for kind in str(r["events"]).split(",") if kind]
         minutes = sum(float(r["minutes"]) for r in rows["full"])
         print(f"  events of full: { ({k: told.count(k) for k in set(told)}) } in {minutes:.1f} minutes")
+        print(
+            f"  slips: { ({k: sum(r['slips'][k] for r in rows['full']) for k in rows['full'][0]['slips']}) }"
+        )
 
 
 def report_verdicts(rows: list[dict[str, Any]]) -> None:
