@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -74,8 +74,10 @@ class Renewed:
 class _Attempt:
     """The anchor of a window as it was when the attempt began, worked out part by part."""
 
-    def __init__(self, config: ReanchorConfig, window: StageOne, p_B: FloatArray, known: TipMap) -> None:
-        self.here, self.known, self.age = np.median(p_B, axis=0), known, 0
+    def __init__(self, config: ReanchorConfig, window: StageOne, rows: Iterable[_Row], known: TipMap) -> None:
+        rows = list(rows)
+        self.here = np.median([r.p_B for r in rows], axis=0)
+        self.began_ns, self.known, self.age = rows[-1].stamp_ns, known, 0
         self._config, self._window = config, window
         self._parts = self._solve()
         self._anchoring: Anchoring | None = None
@@ -128,7 +130,7 @@ class Reanchoring:
     """
 
     def __init__(self, config: ReanchorConfig, like: StageOne) -> None:
-        self._config, self._like = config, like
+        self._config = config
         self._segment = like.fresh()
         self._rows: deque[_Row] = deque()
         self._count = 0
@@ -156,19 +158,18 @@ class Reanchoring:
             self._attempt.age += 1
             return self._renewed(self._attempt) if self._attempt.age >= self._config.later else None
         if self._count % self._config.every == 0 and self._rests(pair.stamp_ns):
-            p = np.stack([r.p_B for r in self._rows])
-            self._attempt = _Attempt(self._config, self._segment.copy(), p, known)
+            self._attempt = _Attempt(self._config, self._segment.copy(), self._rows, known)
         return None
 
     def _renewed(self, attempt: _Attempt) -> Renewed | None:
-        """The end of an attempt; after a new anchor the window begins anew."""
+        """The end of an attempt; after a new anchor the next window begins where this one ended."""
         self._attempt, anchoring = None, attempt.result()
         if anchoring is None:
             return None
         tip_map, known = anchoring.tip_map, attempt.known
         off = attempt.here - tip_map.p
-        self._segment, self._count = self._like.fresh(), 0
-        self._rows.clear()
+        self._forget(attempt.began_ns + 1)
+        self._count = attempt.age
         return Renewed(
             anchoring,
             float(np.linalg.norm(off)),
