@@ -151,15 +151,31 @@ def test_a_row_that_breaks_loose_leaves_the_image_and_comes_back_under_its_own_i
     assert tracked[INTERIOR].all()
 
 
-def test_a_patch_that_leapt_to_the_next_dots_in_a_pause_finds_back():
-    """Nobody saw the way between: the patch's rim, held against its untouched neighbours, mends it from outside in."""
+def leap(size, start_px, end_px, frames=12):
+    """A band that moves out, leaps within one frame, and stays: markers on others' dots after each frame, and doubts."""
     rest = grid()
     tracker, order = start(rest)
-    patch = np.exp(-((np.abs(rest[:, 1] - H / 2) / 60.0) ** 4))[:, None] * [1.0, 0.0]
-    swapped = []
-    for t, x in enumerate([*np.linspace(0, -12, 6), 13.0, *(13.0 + 0.5 * np.sin(np.arange(85) / 5))]):
+    patch = np.exp(-((np.abs(rest[:, 1] - H / 2) / size) ** 4))[:, None] * [1.0, 0.0]
+    swapped, doubtful = [], []
+    stay = end_px + 0.5 * np.sin(np.arange(frames) / 5)
+    for t, x in enumerate([*np.linspace(0, start_px, 6), *stay]):
         found, tracked = step(tracker, order, rest + x * patch, seed=t)
         swapped.append((np.linalg.norm(found - rest - x * patch, axis=1)[tracked] > 8.0).sum())
-    assert max(swapped[:6]) == 0
-    assert swapped[6] > 10  # else this shows nothing
-    assert swapped[-1] == 0
+        doubtful.append(tracker.doubtful)
+    return swapped, doubtful
+
+
+@pytest.mark.parametrize("size", [45, 60, 90])
+def test_a_patch_that_leapt_to_the_next_dots_in_a_pause_keeps_its_own(size):
+    """Nobody saw the way between, and the next dots look nearer: the patch's rim tells."""
+    swapped, doubtful = leap(size, -12, 13)
+    assert max(swapped) == 0
+    assert not any(doubtful)
+
+
+def test_a_leap_of_a_whole_pitch_is_doubtful():
+    """Dots end up where others were: nothing but the rim differs."""
+    swapped, doubtful = leap(60, -16, 16, frames=40)
+    assert not any(doubtful[:6])
+    assert all(doubtful[t] for t in range(6, len(doubtful)) if swapped[t])
+    assert any(doubtful[6:])

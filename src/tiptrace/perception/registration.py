@@ -3,7 +3,7 @@
 Lucas–Kanade brings each marker close; its dot's own centroid says where it is, so that no error is handed on.
 A forward–backward check, the dot's ink and area, and the neighbours' displacement decide whether it is the right
 dot. A marker that fails is lost in this frame; its place is predicted from its neighbours until the dot shows
-again.
+again. Where many leap or are lost at once, nobody saw the way: all are matched to all dots anew.
 """
 
 from __future__ import annotations
@@ -12,22 +12,31 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tiptrace.compiled import compiled
 from tiptrace.perception.centroid import DotMeasurement, DotMeter
+from tiptrace.perception.dot_checks import (
+    INK,
+    came_back,
+    inside_by,
+    look_alike,
+    nearest_to_own,
+    part_twins,
+)
 from tiptrace.perception.markers import Markers
 from tiptrace.perception.neighbourhood import Neighbourhood
+from tiptrace.perception.reseating import Seating
 from tiptrace.perception.tracking import Grey, grey_image, lucas_kanade
 from tiptrace.types import BoolArray, FloatArray, Image
 
-_BACK_PX = 1.0  # forward–backward mismatch
 _LEAP = 0.6  # of the pitch: a marker that moves so far more than the others has gone to another dot
 _SAME_BRIGHTNESS = 0.02
-_AREA = (0.4, 2.2)  # of the first frame's
-_INK = 0.45  # of the first frame's contrast
 _OFF_GRID = 0.38  # of the pitch: distance from where the neighbours say
 _STEADY = 0.3  # of the pitch: a dot that moved less since the frame before is the same dot for certain …
-_LEAPT = 0.1  # … unless so many of all leapt, as after a pause …
-_DOUBT_FRAMES = 75  # … within so many frames
+_UPSET = 0.07  # … unless so many of all leapt or were lost, as after a pause: all are matched anew …
+_LEAPT, _ALL_THERE = (
+    0.04,
+    0.97,
+)  # … if not only dots are hidden: so many leapt, or as many dots show as before …
+_AGAIN = 10  # … and every so many frames, while there is more than one way to match them
 _SEARCH = 0.45  # of the pitch: how far from its predicted place a lost dot is looked for …
 _FOUND = 0.6  # … and may be found
 _MARGIN_PX = 1.0  # around a dot, where the network must not look either
@@ -52,7 +61,8 @@ class RegisteredTracker:
         self._ink, self._area = first.ink, first.area_px
         self._margin = 0.4 * diameter
         self._tracked = np.ones(len(markers), dtype=np.bool_)
-        self._doubt = 0  # frames to go until followed dots are believed again
+        self._seating = Seating(self._rest, self._around.pitch_px)
+        self._sure_px: FloatArray | None = None  # places before a leap that has not been decided
         self._missed, self._frame = np.zeros(len(markers), dtype=np.intp), 0
         self.expected_px: FloatArray = self._rest.copy()
 
@@ -60,6 +70,11 @@ class RegisteredTracker:
     def start_px(self) -> FloatArray:
         """Positions (n, 2) in the first image."""
         return self._rest.copy()
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether markers leapt and there is more than one way to tell whose dots are whose since."""
+        return self._sure_px is not None
 
     @property
     def mask_radius_px(self) -> float:
@@ -78,11 +93,16 @@ class RegisteredTracker:
         near = max(2.0, 0.12 * self._around.pitch_px), _SEARCH * self._around.pitch_px
         seen = self._is_dot(dots, guess, np.where(followed, *near), _EVERY, grey.shape)
         steady = self._steady(dots.uv_px)
-        leapt = np.count_nonzero(seen & ~steady) > _LEAPT * len(seen)
-        self._doubt = _DOUBT_FRAMES if leapt else max(self._doubt - 1, 0)
-        kept = seen & followed & steady & (self._doubt == 0)
+        kept = seen & followed & steady
+        spots = self._spots_after_leap(grey, seen & ~steady, kept)
+        if spots is not None:
+            held = np.where((seen & followed)[:, None], dots.uv_px, np.nan)
+            guess, followed = self._reseat(spots, held, grey.shape)
+            dots = self._meter.measure(grey, guess)
+            seen = self._is_dot(dots, guess, np.where(followed, *near), _EVERY, grey.shape)
+            kept = seen & followed
         again = np.flatnonzero(seen & ~followed)
-        seen[again] = _nearest_to_own(dots.uv_px[again], np.where(kept[:, None], dots.uv_px, guess), again)
+        seen[again] = nearest_to_own(dots.uv_px[again], np.where(kept[:, None], dots.uv_px, guess), again)
         uv, seen = self._search(grey, guess, dots.uv_px, seen)
         seen = self._agree(grey, uv, seen, kept)
         predicted, _ = self._around.predict(uv - self._rest, seen)
@@ -96,16 +116,62 @@ class RegisteredTracker:
         now = self._as_bright_as_before(grey)
         moved, there = lucas_kanade(self._grey, now, start)
         back, again = lucas_kanade(now, self._grey, moved, start, max_level=0)
-        followed = _came_back(
-            start, moved, back, there & again & self._tracked, _LEAP * self._around.pitch_px
-        )
+        followed = came_back(start, moved, back, there & again & self._tracked, _LEAP * self._around.pitch_px)
         limit = _OFF_GRID * self._around.pitch_px
         followed = self._around.drop_strays(moved - start, followed, limit)
-        sure = self._steady(moved) & (self._doubt == 0)
-        followed &= sure | self._around.drop_strays(moved - self._rest, followed, limit)
+        followed &= self._steady(moved) | self._around.drop_strays(moved - self._rest, followed, limit)
         predicted, enough = self._around.predict(moved - self._rest, followed)
         held = np.where(enough[:, None], self._rest + predicted, start)
         return np.where(followed[:, None], moved, held), followed
+
+    def _spots_after_leap(self, grey: Grey, leapt: BoolArray, kept: BoolArray) -> FloatArray | None:
+        """All dots (m, 2) px of an image where markers have to be matched anew; None where they need not.
+
+        Args:
+            grey: The image.
+            leapt: Markers (n,) seen far from where they were.
+            kept: Markers (n,) followed without a break.
+        """
+        if self.doubtful and self._frame % _AGAIN == 0:
+            return self._dots(grey)
+        if np.count_nonzero(self._tracked & ~kept) <= _UPSET * len(kept):
+            return None
+        spots = self._dots(grey)
+        hidden = len(spots) < _ALL_THERE * np.count_nonzero(self._tracked)
+        return None if hidden and np.count_nonzero(leapt) <= _LEAPT * len(kept) else spots
+
+    def _reseat(
+        self, spots: FloatArray, held: FloatArray, shape: tuple[int, ...]
+    ) -> tuple[FloatArray, BoolArray]:
+        """Match all markers to all dots (m, 2); where that does not tell, the neighbours' displacement.
+
+        Held: (n, 2) where following them led, NaN where it did not.
+        """
+        before = self.expected_px if self._sure_px is None else self._sure_px
+        seats = self._seating.seats(before, spots, held, shape)
+        self._sure_px = None if seats.decided else before
+        seated = np.isfinite(seats.uv_px[:, 0])
+        predicted, _ = self._around.predict(
+            np.where(seated[:, None], seats.uv_px, before) - self._rest, seated
+        )
+        return np.where(seated[:, None], seats.uv_px, self._rest + predicted), seated
+
+    def _dots(self, grey: Grey) -> FloatArray:
+        """All that looks like dots, (m, 2) px."""
+        size = 2 * round(_OFF_GRID * self._around.pitch_px) + 1
+        smooth = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), max(self._margin * 0.6, 0.8))
+        depth = 1.0 - smooth / np.maximum(cv2.blur(smooth, (2 * size, 2 * size)), 1.0)
+        v, u = np.nonzero(smooth == cv2.erode(smooth, np.ones((size, size), dtype=np.uint8)))
+        usual = np.median(np.sort(depth[v, u])[-len(self._ink) :])
+        plain = depth[v, u] > INK * usual
+        dips = np.column_stack([u[plain], v[plain]]).astype(np.float64)
+        dots = self._meter.measure(grey, dips)
+        ink, area = np.full(len(dips), np.median(self._ink)), np.full(len(dips), np.median(self._area))
+        reach = np.full(len(dips), self._margin)
+        ok = look_alike(dots.uv_px, dots.ink, dots.area_px, ink, area, dips, reach)
+        ok &= self._whole(dots.uv_px, grey.shape)
+        part_twins(dots.uv_px, -dots.ink, ok, self._margin)
+        return dots.uv_px[ok]
 
     def _steady(self, uv: FloatArray) -> BoolArray:
         """Markers (n,) that are not far from where they were in the frame before."""
@@ -131,14 +197,12 @@ class RegisteredTracker:
 
         A dot is dark, of the right size, not cut by the border, and within a reach (n,) of where it was guessed (n, 2).
         """
-        ok = _look_alike(
-            dots.uv_px, dots.ink, dots.area_px, self._ink[which], self._area[which], guess, reach
-        )
+        ok = look_alike(dots.uv_px, dots.ink, dots.area_px, self._ink[which], self._area[which], guess, reach)
         return ok & self._whole(dots.uv_px, shape)
 
     def _whole(self, uv: FloatArray, shape: tuple[int, ...]) -> BoolArray:
         """Whether dots at places (n, 2) lie in the image entirely."""
-        return _inside_by(uv, self._margin, shape[1], shape[0])
+        return inside_by(uv, self._margin, shape[1], shape[0])
 
     def _search(
         self, grey: Grey, guess: FloatArray, uv: FloatArray, seen: BoolArray
@@ -158,7 +222,7 @@ class RegisteredTracker:
         reach = np.full(len(missing), _FOUND * self._around.pitch_px)
         places = np.where(seen[:, None], uv, guess)  # of all markers, as far as is known
         seen[missing] = self._is_dot(found, guess[missing], reach, missing, grey.shape)
-        seen[missing] &= _nearest_to_own(found.uv_px, places, missing)
+        seen[missing] &= nearest_to_own(found.uv_px, places, missing)
         return uv, seen
 
     def _darkest(self, grey: Grey, guess: FloatArray) -> tuple[int, int]:
@@ -184,7 +248,7 @@ class RegisteredTracker:
         if strays.size:
             predicted, _ = self._around.predict(uv - self._rest, agreed)
             agreed[strays] = ~self._show(grey, self._rest + predicted, uv, strays, seen)
-        _part_twins(uv, off, agreed, self._margin)
+        part_twins(uv, off, agreed, self._margin)
         return agreed
 
     def _show(
@@ -196,76 +260,3 @@ class RegisteredTracker:
         found = self._is_dot(dots, places[which], reach, which, grey.shape)
         taken = np.linalg.norm(dots.uv_px[:, None] - uv[seen], axis=2).min(axis=1) < self._margin
         return np.asarray(found & ~taken)
-
-
-@compiled
-def _nearest_to_own(found: FloatArray, places: FloatArray, missing: NDArray[np.intp]) -> BoolArray:
-    """Whether dots (m, 2) found for missing markers lie nearer to these than to any other marker's place (n, 2)."""
-    own = np.ones(len(missing), dtype=np.bool_)
-    for k in range(len(missing)):
-        u, v = found[k]
-        i = missing[k]
-        away = (u - places[i, 0]) ** 2 + (v - places[i, 1]) ** 2
-        for j in range(len(places)):
-            own[k] &= j == i or away <= (u - places[j, 0]) ** 2 + (v - places[j, 1]) ** 2
-    return own
-
-
-@compiled
-def _part_twins(uv: FloatArray, off: FloatArray, seen: BoolArray, margin: float) -> None:
-    """Of two markers on one dot, unmark the one that is further off its neighbours' displacement."""
-    twice = seen.copy()
-    for i in range(len(uv)):
-        for j in range(i + 1, len(uv)):
-            if twice[i] and twice[j] and (uv[i, 0] - uv[j, 0]) ** 2 + (uv[i, 1] - uv[j, 1]) ** 2 < margin**2:
-                seen[i if off[i] > off[j] else j] = False
-
-
-@compiled
-def _came_back(
-    start: FloatArray, moved: FloatArray, back: FloatArray, found: BoolArray, leap: float
-) -> BoolArray:
-    """Those found that come back to where they started, and do not leap away from the others (all (n, 2), (n,))."""
-    n = len(start)
-    ok = np.empty(n, dtype=np.bool_)
-    u, v, count = np.empty(n), np.empty(n), 0
-    for i in range(n):
-        ok[i] = found[i] and np.hypot(back[i, 0] - start[i, 0], back[i, 1] - start[i, 1]) < _BACK_PX
-        if ok[i]:
-            u[count], v[count] = moved[i, 0] - start[i, 0], moved[i, 1] - start[i, 1]
-            count += 1
-    if count == 0:
-        return ok
-    common_u, common_v = np.median(u[:count]), np.median(v[:count])
-    for i in range(n):
-        away = np.hypot(moved[i, 0] - start[i, 0] - common_u, moved[i, 1] - start[i, 1] - common_v)
-        ok[i] &= away < leap
-    return ok
-
-
-@compiled
-def _look_alike(
-    uv: FloatArray,
-    ink: FloatArray,
-    area: FloatArray,
-    ink_0: FloatArray,
-    area_0: FloatArray,
-    guess: FloatArray,
-    reach: FloatArray,
-) -> BoolArray:
-    """Whether dots have ink and area as in the first frame, within reach of where they were guessed (n,)."""
-    ok = np.empty(len(uv), dtype=np.bool_)
-    for i in range(len(uv)):
-        ratio = area[i] / area_0[i]
-        ok[i] = ink[i] > _INK * ink_0[i] and _AREA[0] < ratio < _AREA[1]
-        ok[i] &= np.hypot(uv[i, 0] - guess[i, 0], uv[i, 1] - guess[i, 1]) < reach[i]
-    return ok
-
-
-@compiled
-def _inside_by(uv: FloatArray, margin: float, width: int, height: int) -> BoolArray:
-    """Whether places (n, 2) lie in an image, at least a margin from its outermost pixels."""
-    ok = np.empty(len(uv), dtype=np.bool_)
-    for i in range(len(uv)):
-        ok[i] = margin <= uv[i, 0] <= width - 1 - margin and margin <= uv[i, 1] <= height - 1 - margin
-    return ok

@@ -29,6 +29,7 @@ def warm_up() -> None:
     seeds = seed(image, reference)
     tracker = RegisteredTracker(image, seeds.markers)
     lift = FullLifter(depth, tracker, seeds.ghosts)
+    tracker.update(_dots(0.5 * _PITCH_PX))  # a leap
     uv_px, tracked = tracker.update(_dots(1.6))
     map_ = lift(image, uv_px, tracked).map
     if map_ is not None:
