@@ -5,27 +5,31 @@ from __future__ import annotations
 import json
 import os
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import av
 import cv2
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import yaml
 
+from tiptrace.config import Rig, load_yaml
 from tiptrace.errors import ConfigError, OutputError, RecordingError
 from tiptrace.export.dataset import LeRobotOptions, export_dataset
 from tiptrace.export.episodes import Episode, Source, find_sources, load_episode, traced_episode
 from tiptrace.export.images import EncodedImages
 from tiptrace.export.lerobot_annotate import annotate
 from tiptrace.export.lerobot_format import PHASE, TIP_FEATURES, Feature, pooled, stats_of
-from tiptrace.export.lerobot_reader import open_lerobot
+from tiptrace.export.lerobot_reader import LeRobotStream, open_lerobot
 from tiptrace.export.lerobot_writer import LikeTheFirst, write_lerobot
 from tiptrace.sim.spec import make_spec
 from tiptrace.streams.simulated import SimulatedStream
 from tiptrace.streams.writer import write_recording
-from tiptrace.types import SIDES, Side, Status, TipEstimate
+from tiptrace.types import SIDES, Image, Side, Status, TipEstimate
 
 SHORT = {"mode": "markers", "travel_m": 0.011, "fps": 25.0, "anchoring_s": 1.4}
 READER = Path(__file__).with_name("lerobot_read.py")
@@ -147,9 +151,11 @@ def pictured(tmp_path_factory: pytest.TempPathFactory) -> tuple[Episode, Path]:
     return episode, folder
 
 
-def theirs(folder: Path, episode: Episode, version: str = "v3.0", tactile: bool = True) -> Path:
-    """A dataset as others have it: poses and tactile images without any tip."""
-    write_lerobot(folder, [episode, episode], version)
+def theirs(
+    folder: Path, episode: Episode, version: str = "v3.0", tactile: bool = True, first: Episode | None = None
+) -> Path:
+    """A dataset as others have it, of two episodes: poses and tactile images without any tip."""
+    write_lerobot(folder, [first or episode, episode], version)
     info = json.loads((folder / "meta/info.json").read_text())
     gone = [n for n in info["features"] if n.startswith("observation.tip.") and n != PHASE]
     gone += [] if tactile else [n for n in info["features"] if "tactile" in n]
@@ -186,6 +192,99 @@ def test_a_dataset_is_annotated_at_its_own_frames(
     assert set(TIP_FEATURES) <= set(json.loads((tmp_path / "ours/meta/info.json").read_text())["features"])
     with pytest.raises(ConfigError, match="already"):
         annotate(open_lerobot(tmp_path / "ours"), tmp_path / "again", rig)
+
+
+def filmed(root: Path, version: str, frames: int) -> Path:
+    """The same dataset of two episodes with its tactile images as videos, as LeRobot itself keeps them."""
+    info = json.loads((root / "meta/info.json").read_text())
+    keys = [n for n in info["features"] if "tactile" in n]
+    tables = [pq.read_table(f) for f in sorted((root / "data").rglob("*.parquet"))]
+    layout = "chunk-{chunk_index:03d}/file-{file_index:03d}"
+    if version == "v2.1":
+        layout = "chunk-{episode_chunk:03d}/episode_{episode_index:06d}"
+    info["video_path"] = f"videos/{{video_key}}/{layout}.mp4"
+    for key in keys:
+        info["features"][key]["dtype"] = "video"
+        cells = [cell["bytes"] for table in tables for cell in table[key].to_pylist()]
+        images = [cv2.imdecode(np.frombuffer(c, np.uint8), cv2.IMREAD_COLOR) for c in cells]
+        parts = [images] if version == "v3.0" else [images[:frames], images[frames:]]
+        for k, part in enumerate(parts):
+            place = {"chunk_index": 0, "file_index": 0, "episode_chunk": 0, "episode_index": k}
+            path = root / info["video_path"].format(video_key=key, **place)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            film(path, part, round(info["fps"]))
+    for file, table in zip(sorted((root / "data").rglob("*.parquet")), tables, strict=True):
+        pq.write_table(table.drop_columns(keys).replace_schema_metadata(None), file)
+    if version == "v3.0":
+        (file,) = (root / "meta/episodes").rglob("*.parquet")
+        table = pq.read_table(file)
+        for key in keys:
+            for name, values in (("chunk_index", [0, 0]), ("file_index", [0, 0])):
+                table = table.append_column(f"videos/{key}/{name}", pa.array(values))
+            begins = pa.array([0.0, frames / info["fps"]])
+            table = table.append_column(f"videos/{key}/from_timestamp", begins)
+        pq.write_table(table, file)
+    (root / "meta/info.json").write_text(json.dumps(info))
+    return root
+
+
+def backwards(images: EncodedImages) -> EncodedImages:
+    turned = EncodedImages()
+    for data in reversed(images.encoded):
+        turned.append(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR))
+    return turned
+
+
+def film(path: Path, images: list[Image], fps: int) -> None:
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("mpeg4", rate=fps)
+        stream.height, stream.width = images[0].shape[:2]
+        stream.pix_fmt, stream.bit_rate = "yuv420p", 20_000_000
+        for image in images:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="bgr24")))
+        container.mux(stream.encode())
+
+
+@pytest.mark.parametrize("version", ["v3.0", "v2.1"])
+def test_a_dataset_with_videos_is_read_frame_by_frame_and_annotated(
+    pictured: tuple[Episode, Path], tmp_path: Path, version: str
+):
+    episode, folder = pictured
+    first = replace(episode, images={side: backwards(i) for side, i in episode.images.items()})
+    source = open_lerobot(theirs(tmp_path / "images", episode, version, first=first))
+    root = theirs(tmp_path / "videos", episode, version, first=first)
+    films = open_lerobot(filmed(root, version, len(episode.position)))
+    rig = load_yaml(Rig, folder / "rig.yaml")
+    for index in (0, 1):
+        for side in SIDES:
+            still = list(LeRobotStream(source, index, rig).images(side))
+            moving = list(LeRobotStream(films, index, rig).images(side))
+            assert len(still) == len(moving)
+            off = np.array([[np.abs(a.astype(float) - b).mean() for b in still] for a in moving])
+            assert off.diagonal().max() < 4.0, "grey levels: coded, but the same picture"
+            contact = np.flatnonzero(off.max(axis=0) > 6.0)  # pictures that look unlike others
+            assert len(contact) > 3
+            np.testing.assert_array_less(np.abs(off[contact].argmin(axis=1) - contact), 3)
+    untouched: dict[Side, Path] = {side: folder / f"{side}.png" for side in SIDES}
+    done = annotate(films, tmp_path / "ours", folder / "rig.yaml", None, untouched, method="paper")
+    assert not done.failures
+    rows = [
+        r for f in sorted((tmp_path / "ours/data").rglob("*.parquet")) for r in pq.read_table(f).to_pylist()
+    ]
+    assert np.mean([r["observation.tip.valid"] for r in rows]) > 0.5
+
+
+def test_a_film_that_ends_early_is_told(pictured: tuple[Episode, Path], tmp_path: Path):
+    episode, folder = pictured
+    root = filmed(theirs(tmp_path / "a", episode, "v2.1"), "v2.1", len(episode.position))
+    source = open_lerobot(root)
+    path, _ = source.video_file(0, source.tactile["left"])
+    film(path, [np.zeros((240, 320, 3), np.uint8)] * 3, 10)
+    with pytest.raises(RecordingError, match="holds 3 of the episode's"):
+        list(LeRobotStream(source, 0, load_yaml(Rig, folder / "rig.yaml")).images("left"))
+    path.write_bytes(b"no film")
+    with pytest.raises(RecordingError, match="cannot be decoded"):
+        list(LeRobotStream(source, 0, load_yaml(Rig, folder / "rig.yaml")).images("left"))
 
 
 def test_a_dataset_without_tactile_images_is_refused_by_what_it_lacks(tmp_path: Path):
