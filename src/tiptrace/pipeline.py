@@ -12,7 +12,16 @@ from tiptrace.errors import PerceptionError, RecordingError
 from tiptrace.streams.sync_report import SyncReport
 from tiptrace.streams.synchronise import SyncSettings, synchronise
 from tiptrace.tracer import DEFAULT_OPTIONS, TipTracer, TracerOptions, make_tracer
-from tiptrace.types import Observation, Phase, SensedPair, Stream, TipEstimate, TipTrajectory
+from tiptrace.types import (
+    Observation,
+    Phase,
+    SensedFinger,
+    SensedPair,
+    Side,
+    Stream,
+    TipEstimate,
+    TipTrajectory,
+)
 
 STEPS = ("acquire", "sense", "estimate")
 
@@ -132,15 +141,25 @@ def open_tracer(stream: Stream, method: str, options: TracerOptions = DEFAULT_OP
     Raises:
         ConfigError: an unknown method; the valid ones are listed.
     """
-    from concurrent.futures import ThreadPoolExecutor
+    from concurrent.futures import ThreadPoolExecutor, wait
 
     import cv2
 
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
-        with ThreadPoolExecutor(max_workers=2, thread_name_prefix="finger") as pool:
-            yield make_tracer(stream, method, both=pool.map, options=options)
+        with ThreadPoolExecutor(max_workers=1, thread_name_prefix="finger") as pool:
+
+            def both(sense: Callable[[Side], SensedFinger], sides: Iterable[Side]) -> list[SensedFinger]:
+                """The first side here, the other beside it."""
+                here, beside = sides
+                other = pool.submit(sense, beside)
+                try:
+                    return [sense(here), other.result()]
+                finally:
+                    wait([other])
+
+            yield make_tracer(stream, method, both=both, options=options)
     finally:
         cv2.setNumThreads(threads)
 

@@ -360,3 +360,23 @@ def test_nothing_is_written_over_and_a_full_disk_is_refused(tmp_path: Path) -> N
         Recorder(tmp_path / "c.mcap", Timeline(), rig=rig, min_free_bytes=10**18),
     ):
         pass
+
+
+def test_what_a_loop_waits_for_wakes_it_at_once() -> None:
+    """Poses come 500 times a second: each wakes the loop only while an image may wait for it."""
+    rig, references, samples = short_trial()
+    stream = LiveStream(
+        rig, {}, FeedRobot(feed_from(samples), 0.0, Timeline()), Timeline(), references=references
+    )
+
+    def woken() -> bool:
+        stream._wake.clear()
+        stream._robot_came()
+        return stream._wake.is_set()
+
+    stream._woken_s, stream._image_s = time.monotonic() + 1.0, 0.0
+    assert not woken()
+    stream._tap_robot(PhaseSample(0, Phase.ANCHORING), 0)
+    assert woken()
+    stream._woken_s, stream._image_s = time.monotonic() + 1.0, time.monotonic()
+    assert woken()

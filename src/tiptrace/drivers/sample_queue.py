@@ -14,7 +14,6 @@ from tiptrace.errors import DeviceError
 from tiptrace.types import FloatArray, PoseSample
 
 _QUEUE = 4000  # eight seconds at 500 Hz; the oldest goes first
-_WAKE_NS = 4_000_000  # no arm's pose is worth a wake-up of its own
 _MAX_SPEED = 5.0  # m/s: no arm that holds a GelSight Mini is faster
 _MAX_TURN = 20.0  # rad/s
 _JUMP_M, _JUMP_RAD = 0.005, 0.1
@@ -35,7 +34,6 @@ class SampleQueue:
         self._samples: deque[RobotSample] = deque()
         self._lock = threading.Lock()
         self._last: PoseSample | None = None
-        self._woken_ns = 0
         self._error: DeviceError | None = None
         self.wake: Wake = lambda: None
         self.tap: RobotTap | None = None
@@ -59,9 +57,7 @@ class SampleQueue:
                 self._samples.popleft()
                 self.meter.fault("dropped")
             self._samples.append(sample)
-        if now_ns - self._woken_ns > _WAKE_NS or not isinstance(sample, PoseSample):
-            self._woken_ns = now_ns
-            self.wake()
+        self.wake()
 
     def restart(self) -> None:
         """The stream begins anew after a pause: stamps may start again."""

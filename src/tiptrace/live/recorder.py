@@ -25,6 +25,7 @@ _CHUNK_BYTES = (
 )  # 0.07 s of two cameras: what a crash can cost beyond the last sync; each costs 1 kB of index
 _QUEUE_BYTES = 64 * 1024 * 1024  # a minute of a disk that stands still
 _POSE_BYTES = 200
+_PATIENCE = 400  # samples that wait for a good time to be written
 _MIN_FREE_BYTES = 500 * 1024 * 1024
 _SPARE_BYTES = 20 * 1024 * 1024
 
@@ -147,8 +148,13 @@ class Recorder:
                 return
             self._queue.append((sample, log_time_ns, jpeg))
             self._bytes += size
-            if jpeg is not None or len(self._queue) > 100:
+            if len(self._queue) > _PATIENCE:
                 self._ready.notify()
+
+    def nudge(self) -> None:
+        """Now is a good time to write; without that it is done five times a second."""
+        with self._ready:
+            self._ready.notify()
 
     # --- the thread ----------------------------------------------------------------------------------------
 

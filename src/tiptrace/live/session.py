@@ -144,9 +144,15 @@ class LiveSession:
             for step in steps(self.stream, tracer, self.report, self.stream.settings, self._bad_pair):
                 self.stage_one = monitor.update(step.estimate)
                 self._show(step)
-                if isinstance(tracer.estimator, FullEstimator):
-                    tracer.estimator.use_pause()
+                self._use_pause(tracer)
         return self.summary()
+
+    def _use_pause(self, tracer: TipTracer) -> None:
+        """Until the next images come: what no estimate waits for, and would only hold up."""
+        if self.recorder is not None:
+            self.recorder.nudge()
+        if isinstance(tracer.estimator, FullEstimator):
+            tracer.estimator.use_pause()
 
     def summary(self) -> LiveSummary:
         """The session so far."""

@@ -18,7 +18,17 @@ from tiptrace.drivers.base import Camera, DeviceHealth, DeviceStatus, Frame, Pos
 from tiptrace.drivers.timeline import Timeline
 from tiptrace.errors import ConfigError
 from tiptrace.streams.synchronise import LIVE, SyncSettings
-from tiptrace.types import SIDES, Image, ImageSample, OpeningSample, Phase, PhaseSample, Sample, Side
+from tiptrace.types import (
+    SIDES,
+    Image,
+    ImageSample,
+    OpeningSample,
+    Phase,
+    PhaseSample,
+    PoseSample,
+    Sample,
+    Side,
+)
 
 _IDLE_S = 0.2
 _ALIKE = 0.6  # of the rates of two cameras of one kind
@@ -27,6 +37,8 @@ _WARM_UP_S, _WARM_UP_FRAMES = 2.0, 8
 _SPACING_SHARE = 0.85  # of the measured period between frames: closer ones do not come
 _ARRIVALS = 256
 _ENDED_GRACE_S = 0.5
+_POSE_WAKE_S = 0.004  # no arm's pose is worth a wake-up of its own …
+_AWAITED_S = 0.02  # … but for so long after an image, which may wait for it
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,6 +115,7 @@ class LiveStream:
         self._begin_ns: int | None = None
         self._arrived: OrderedDict[tuple[Side, int], Arrival] = OrderedDict()
         self._devices = ExitStack()
+        self._woken_s = self._image_s = 0.0
 
     # --- opening and closing -------------------------------------------------------------------------------
 
@@ -116,7 +129,7 @@ class LiveStream:
         with ExitStack() as opened:
             check_frames(self._robot.frames, self.rig.frames)
             opened.callback(self._robot.close)
-            self._robot.start(self._wake.set, self._tap_robot)
+            self._robot.start(self._robot_came, self._tap_robot)
             for side in SIDES:
                 opened.callback(self._cameras[side].close)
                 self._cameras[side].start(self._wake.set, partial(self._tap_frame, side))
@@ -212,11 +225,19 @@ class LiveStream:
                 if now - ended_at > _ENDED_GRACE_S:
                     return
 
+    def _robot_came(self) -> None:
+        """In the robot's thread: wake the loop, if it is worth it."""
+        now = time.monotonic()
+        if now - self._woken_s > _POSE_WAKE_S or now - self._image_s < _AWAITED_S:
+            self._woken_s = now
+            self._wake.set()
+
     def _gather(self) -> list[Sample]:
         """What has come, in the order of arrival, so that a busy loop finds each image among its own poses."""
         found: list[tuple[int, Sample]] = []
         for side in SIDES:
             for frame in self._cameras[side].take():
+                self._image_s = time.monotonic()
                 self._arrived[side, frame.stamp_ns] = Arrival(frame.arrived_ns, frame.after, frame.settled)
                 found.append((frame.arrived_ns, ImageSample(side, frame.stamp_ns, frame.image)))
         for sample in self._robot.take():
@@ -246,6 +267,8 @@ class LiveStream:
 
     def _tap_robot(self, sample: RobotSample, arrived_ns: int) -> None:
         """Phase marks come back through :meth:`mark`; openings are dated by their log time, here as offline."""
+        if not isinstance(sample, PoseSample):
+            self._woken_s = 0.0  # worth a wake-up
         if not isinstance(sample, PhaseSample):
             self._tap(sample, sample.stamp_ns if isinstance(sample, OpeningSample) else arrived_ns, None)
 
