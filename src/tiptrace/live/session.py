@@ -13,12 +13,14 @@ import numpy as np
 from tiptrace.drivers.base import DeviceHealth, DeviceStatus
 from tiptrace.errors import PerceptionError
 from tiptrace.estimation.full import FullEstimator
+from tiptrace.estimation.warm_up import warm_up as warm_up_estimation
 from tiptrace.live.monitor import StageOneMonitor, StageOneView
 from tiptrace.live.phases import PhaseMarker
 from tiptrace.live.recorder import Recorder
 from tiptrace.live.source_watch import SourceWatch
 from tiptrace.live.summary import LiveSummary, Tally
 from tiptrace.live.views import Views
+from tiptrace.perception.warm_up import warm_up as warm_up_sensing
 from tiptrace.pipeline import Step, open_tracer, steps
 from tiptrace.snapshot import Snapshot
 from tiptrace.streams.live import LiveStream
@@ -59,6 +61,8 @@ class LiveSession:
         recorder: Recorder | None = None,
         wait_for_mark: bool = False,
     ) -> None:
+        warm_up_sensing()  # what is slow the first time is over before the devices open
+        warm_up_estimation()
         self.stream, self.method, self.recorder = stream, method, recorder
         self.phases = PhaseMarker(self._emit_phase, waiting=wait_for_mark)
         self.report = SyncReport()
@@ -128,11 +132,13 @@ class LiveSession:
             if not opened:
                 stack.enter_context(self.stream)
             _rehearse(self.stream, self.method)
+            self.stream.forget()
             if self.recorder is not None:
                 stack.enter_context(self.recorder)
             tracer = stack.enter_context(open_tracer(self.stream, self.method))
             if self.stream.first_images:
                 tracer.sensing.prepare()
+                self.stream.forget()
             stack.enter_context(_no_sweeps())
             if not self.stream.standby:
                 self.stream.begin()

@@ -18,17 +18,7 @@ from tiptrace.drivers.base import Camera, DeviceHealth, DeviceStatus, Frame, Pos
 from tiptrace.drivers.timeline import Timeline
 from tiptrace.errors import ConfigError
 from tiptrace.streams.synchronise import LIVE, SyncSettings
-from tiptrace.types import (
-    SIDES,
-    Image,
-    ImageSample,
-    OpeningSample,
-    Phase,
-    PhaseSample,
-    PoseSample,
-    Sample,
-    Side,
-)
+from tiptrace.types import SIDES, Image, ImageSample, OpeningSample, Phase, PhaseSample, Sample, Side
 
 _IDLE_S = 0.2
 _ALIKE = 0.6  # of the rates of two cameras of one kind
@@ -161,6 +151,11 @@ class LiveStream:
             self.period_s = 1.0 / (max(known) if alike else min(known))
             self.settings = replace(LIVE, min_frame_spacing_s=_SPACING_SHARE / max(known))
 
+    def forget(self) -> None:
+        """Drop the images that wait: while a trial is prepared nobody takes them, and full queues count as faults."""
+        for camera in self._cameras.values():
+            camera.take()
+
     def begin(self) -> None:
         """From now on samples count; what was stamped before is neither delivered nor shown to the tap."""
         self._begin_ns = self.timeline.now_ns()
@@ -267,7 +262,7 @@ class LiveStream:
 
     def _tap_robot(self, sample: RobotSample, arrived_ns: int) -> None:
         """Phase marks come back through :meth:`mark`; openings are dated by their log time, here as offline."""
-        if not isinstance(sample, PoseSample):
+        if isinstance(sample, PhaseSample | OpeningSample):
             self._woken_s = 0.0  # worth a wake-up
         if not isinstance(sample, PhaseSample):
             self._tap(sample, sample.stamp_ns if isinstance(sample, OpeningSample) else arrived_ns, None)
