@@ -188,12 +188,14 @@ class FingerMarkers:
         tracked: (n,) False where the marker is lost in this frame (its row is then NaN).
         uv_px: (n, 2) image position, NaN where lost; None where there is no image.
         depth_sigma_m: (n,) standard deviation of the depth, where the chain gives one.
+        doubtful: Whether markers leapt, as in a pause, and it is not certain which is which since.
     """
 
     x_S: FloatArray
     tracked: BoolArray
     uv_px: FloatArray | None = None
     depth_sigma_m: FloatArray | None = None
+    doubtful: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -152,7 +152,7 @@ def test_a_row_that_breaks_loose_leaves_the_image_and_comes_back_under_its_own_i
 
 
 def leap(size, start_px, end_px, frames=12):
-    """A band that moves out, leaps within one frame, and stays: markers on others' dots after each frame, and doubts."""
+    """A band that moves out, leaps within one frame, and stays: markers on others' dots after each frame; doubts."""
     rest = grid()
     tracker, order = start(rest)
     patch = np.exp(-((np.abs(rest[:, 1] - H / 2) / size) ** 4))[:, None] * [1.0, 0.0]

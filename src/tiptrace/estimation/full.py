@@ -276,8 +276,9 @@ class FullEstimator:
         assert self._anchoring is not None
         a = self._anchoring
         residual = a.fit.residuals(markers.X[None], motions)[0]
+        c, twist, doubtful = a.tip_map.c, a.fit.twist(residual), markers.doubtful
         return self._monitor.judge(
-            a.reference, motions, a.tip_map.c, hand.T_B_E[0], residual, a.fit.twist(residual), repeated
+            a.reference, motions, c, hand.T_B_E[0], residual, twist, repeated, doubtful
         )
 
     def _displacement(self, estimate: TipEstimate, tip: Tip, extra: FloatArray) -> TipEstimate:

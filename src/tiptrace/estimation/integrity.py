@@ -28,6 +28,7 @@ class Findings:
         jumped: Rows of markers that jumped.
         lost: Rows of markers in use that have not been seen for several frames.
         disagree: The pads twist against each other.
+        misfit: The markers are far from moving as one body, or the tracker cannot tell whose dots are whose.
         in_contact: Whether the tip touches.
         axial_m: Displacement of the tool along its axis, out of the hand.
     """
@@ -38,6 +39,7 @@ class Findings:
     jumped: BoolArray
     lost: BoolArray
     disagree: bool
+    misfit: bool
     in_contact: bool
     axial_m: float
 
@@ -94,6 +96,7 @@ class Monitor:
         residual_E: FloatArray,
         twist_rad: float,
         repeated: tuple[bool, bool],
+        doubtful: bool = False,
     ) -> Findings:
         """One frame of Stage II.
 
@@ -105,6 +108,7 @@ class Monitor:
             residual_E: (N, 3) markers less their fitted places, NaN where lost or unused.
             twist_rad: Twist of the left pad's markers against the right's.
             repeated: From :meth:`repeated`.
+            doubtful: Whether the tracker of a finger cannot tell whose dots are whose.
         """
         c = self._config
         D = motions.R[0] @ c_E + motions.t[0] - c_E
@@ -123,6 +127,7 @@ class Monitor:
             jumped=self._jumped(residual_E),
             lost=self._lost(residual_E, ref.rows),
             disagree=self._twisted >= c.twist_frames,
+            misfit=doubtful or float(motions.residual_m[0]) > max(c.misfit_m, c.misfit * ref.residual_m),
             in_contact=in_contact,
             axial_m=axial,
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +24,9 @@ class IntegrityConfig(BaseModel):
     slip: SlipLimits = SlipLimits()
     # of one marker between two frames, beyond the tool's own motion
     jump_m: float = Field(default=1.2e-3, gt=0)
+    # residual of the rigid fit beyond which it is none: in multiples of Stage I's, and at least
+    misfit: float = Field(default=4.0, gt=1)
+    misfit_m: float = Field(default=1.5e-4, gt=0)
     twist_limit_rad: float = Field(default=0.03, gt=0)  # of one pad's markers against the other's
     twist_frames: int = Field(default=3, ge=1)
     # the tool springs out along its axis when the tip lifts off
@@ -53,6 +57,8 @@ class Reference:
         twist_spread_rad: Its spread (1.48 × median absolute deviation).
         slip: How much frames differ where nothing slips.
         rows: Markers in use.
+        residual_m: 95th percentile of the rigid fit's root mean square residual in the gels' planes; infinite where
+            it is not known.
     """
 
     chi2: float
@@ -64,6 +70,7 @@ class Reference:
     twist_spread_rad: float
     slip: SlipLevels
     rows: IntArray
+    residual_m: float = math.inf
 
 
 def reference(
@@ -101,4 +108,5 @@ def reference(
         twist_spread_rad=1.48 * float(np.median(np.abs(twists - middle))),
         slip=slip_levels(D, residual, normal_E) if staged else SlipLevels(0.0, 0.0),
         rows=np.flatnonzero(fit.trust > 0),
+        residual_m=float(np.percentile(motions.residual_m, 95)),
     )

@@ -19,12 +19,14 @@ class PadMarkers:
         x_S: (N, 3) the same in their own F_S.
         pad: (N,) 0 left, 1 right.
         axes: (2, 3, 3) columns u, v, normal of each pad in F_E.
+        doubtful: Whether a finger cannot tell whose dots are whose.
     """
 
     X: FloatArray
     x_S: FloatArray
     pad: FloatArray
     axes: FloatArray
+    doubtful: bool = False
 
     @classmethod
     def of(cls, pair: SensedPair) -> PadMarkers:
@@ -34,4 +36,5 @@ class PadMarkers:
         X = np.concatenate([apply(f.T_E_S, x) for f, x in zip(fingers, x_S, strict=True)])
         axes = np.array([f.T_E_S[:3, :3] for f in fingers])
         pad = np.repeat([0, 1], [len(x) for x in x_S])
-        return cls(X, np.concatenate(x_S), pad, axes)
+        doubtful = any(f.markers.doubtful for f in fingers)
+        return cls(X, np.concatenate(x_S), pad, axes, doubtful)

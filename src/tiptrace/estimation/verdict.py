@@ -15,6 +15,10 @@ _SLIP = (
     "the markers no longer move as one body: the tool slips in the grasp. Markers ride on the gel and not on the "
     "tool: how far it slipped they cannot show, positions from here on carry a larger covariance"
 )
+_MISFIT = (
+    "the markers are far from moving as one body, as after a pause in which they leapt to their neighbours' places: "
+    "positions are not to be relied on until they fit again"
+)
 _LOST = "the tool sprang out along its axis by {:.1f} mm: the tip does not touch"
 
 
@@ -45,7 +49,10 @@ class Verdict:
             self.log.note("grasp-slip", stamp_ns, stamp_ns, _SLIP)
         if f.disagree:
             self.log.note("left-right-disagreement", stamp_ns, stamp_ns, _DISAGREE)
-        extra = self.slip_sigma_m**2 * np.eye(3) if self.slipped else np.zeros((3, 3))
+        if f.misfit:
+            self.log.note("marker-jump", stamp_ns, stamp_ns, _MISFIT)
+        vague = self.slipped or f.misfit
+        extra = self.slip_sigma_m**2 * np.eye(3) if vague else np.zeros((3, 3))
         if not f.in_contact:
             self.log.note("contact-lost", stamp_ns, stamp_ns, _LOST.format(f.axial_m * 1e3))
             self._contact = False
@@ -53,7 +60,7 @@ class Verdict:
         if not self._contact:
             self._contact = True
             self.log.note("contact-regained", stamp_ns, stamp_ns, "the tip touches again")
-        doubtful = self.slipped or f.disagree or any(f.repeated) or bool(f.jumped.any())
+        doubtful = vague or f.disagree or any(f.repeated) or bool(f.jumped.any())
         return (Status.DEGRADED if doubtful else Status.OK), extra
 
     def _note_frames(self, stamp_ns: int, f: Findings) -> None:

@@ -92,7 +92,8 @@ class Finger:
             depths = self._lifter(image, uv_px, tracked)
         self._map = depths.map
         x_S = lift(uv_px, depths.depth_m, self._sensor.image_size_px, self._sensor.metres_per_px)  # (n, 3)
-        return FingerMarkers(x_S=x_S, tracked=tracked, uv_px=uv_px, depth_sigma_m=depths.sigma_m)
+        doubtful = isinstance(self._tracker, RegisteredTracker) and self._tracker.doubtful
+        return FingerMarkers(x_S, tracked, uv_px, depths.sigma_m, doubtful)
 
     def _track(self, image: Image) -> tuple[FloatArray, BoolArray]:
         """Positions (n, 2), NaN where lost, and tracked (n,); the first image starts tracker and lifter."""
