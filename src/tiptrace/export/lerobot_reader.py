@@ -221,7 +221,9 @@ def _video(path: Path, begin_s: float, count: int) -> Iterator[Image]:
     given = 0
     try:
         with av.open(str(path)) as container:
-            container.seek(round(begin_s * av.time_base))  # to the key frame before: many episodes share a file
+            container.seek(
+                round(begin_s * av.time_base)
+            )  # to the key frame before: many episodes share a file
             for frame in container.decode(video=0):
                 if frame.time < begin_s - 1e-4:
                     continue
