@@ -122,7 +122,7 @@ def steps(
             on_bad_pair(observation, error)
             continue
         middle = time.perf_counter()
-        estimate = tracer.estimator.update(sensed)
+        estimate = tracer.estimate(sensed)
         end = time.perf_counter()
         times_ms = (acquired_ms, (middle - start) * 1e3, (end - middle) * 1e3)
         yield Step(observation, sensed, replace(estimate, loop_ms=sum(times_ms)), times_ms)

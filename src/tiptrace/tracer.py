@@ -82,6 +82,11 @@ class Sensing:
         for side in SIDES:
             self._finger(side)
 
+    def match_anew(self) -> None:
+        """Forget whose dots the markers are on; they are matched to all dots in the frames to come."""
+        for finger in self.fingers.values():
+            finger.match_anew()
+
     def _sense(self, side: Side, observation: Observation) -> SensedFinger:
         seen = observation.finger(side)
         if isinstance(seen.sample, ImageSample):
@@ -123,7 +128,14 @@ class TipTracer:
 
     def update(self, observation: Observation) -> TipEstimate:
         """One step of Algorithm 1: constant cost, constant memory, causal."""
-        return self.estimator.update(self.sensing(observation))
+        return self.estimate(self.sensing(observation))
+
+    def estimate(self, pair: SensedPair) -> TipEstimate:
+        """The second half of :meth:`update`; where markers have long been astray, they are matched to dots anew."""
+        estimate = self.estimator.update(pair)
+        if isinstance(self.estimator, FullEstimator) and self.estimator.bewildered:
+            self.sensing.match_anew()
+        return estimate
 
     @property
     def anchor(self) -> Anchor | None:

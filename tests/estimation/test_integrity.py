@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from tiptrace.estimation.full import FullEstimator
+from tiptrace.tracer import Sensing, TipTracer
 from tiptrace.types import FloatArray, SensedPair, Status, TipEstimate
 
 from .synthetic import Synthetic
@@ -32,6 +33,18 @@ def changed(pair: SensedPair, x_S: FloatArray | None = None, doubtful: bool = Fa
 def traced(pairs: list[SensedPair]) -> tuple[FullEstimator, list[TipEstimate]]:
     estimator = FullEstimator()
     return estimator, [estimator.update(pair) for pair in pairs]
+
+
+class Counting(Sensing):
+    """Counts how often markers are to be matched anew."""
+
+    matched_anew = 0
+
+    def __init__(self) -> None:
+        pass
+
+    def match_anew(self) -> None:
+        self.matched_anew += 1
 
 
 @pytest.fixture(scope="module")
@@ -65,3 +78,18 @@ def test_what_the_tracker_cannot_tell_is_not_ok(pairs: list[SensedPair]) -> None
     _, estimates = traced([changed(p, doubtful=True) if k in inside else p for k, p in enumerate(pairs)])
     degraded = [k for k, e in enumerate(estimates) if e.status is Status.DEGRADED]
     assert degraded == list(inside)
+
+
+def test_all_markers_of_one_pad_a_pitch_away_are_not_ok(pairs: list[SensedPair]) -> None:
+    inside = range(LEAP, LEAP + LONG)
+
+    def shifted(pair: SensedPair) -> SensedPair:
+        return changed(pair, pair.left.markers.x_S + [0.0, 2e-3, 0.0])
+
+    sensing = Counting()
+    estimator = FullEstimator()
+    tracer = TipTracer(sensing, estimator)
+    estimates = [tracer.estimate(shifted(p) if k in inside else p) for k, p in enumerate(pairs)]
+    assert all(estimates[k].status is Status.DEGRADED for k in inside)
+    assert {"marker-jump"} <= {e.kind for e in estimator.events}
+    assert sensing.matched_anew == LONG // 10, "after every ten frames"

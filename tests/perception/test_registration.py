@@ -179,3 +179,26 @@ def test_a_leap_of_a_whole_pitch_is_doubtful():
     assert not any(doubtful[:6])
     assert all(doubtful[t] for t in range(6, len(doubtful)) if swapped[t])
     assert any(doubtful[6:])
+
+
+@pytest.mark.parametrize("size", [60, 90])
+def test_markers_on_others_dots_find_back_when_they_are_matched_anew(size):
+    rest = grid()
+    share = np.exp(-((np.abs(rest[:, 1] - H / 2) / size) ** 4))[:, None] * [1.0, 0.0]
+    tracker, order = start(rest)
+    pitch = np.linalg.norm(rest[1:] - rest[0], axis=1).min()
+    for t in range(5):
+        uv = rest + 2.0 * t * share
+        step(tracker, order, uv, seed=t)
+    tracker.expected_px = tracker.expected_px + np.round(share[np.argsort(order)]) * pitch  # a pitch away
+    for t in range(5, 40):
+        if t == 15:
+            tracker.match_anew()
+        uv = rest + (8.0 + 0.5 * np.sin(t / 5)) * share
+        found, tracked = step(tracker, order, uv, seed=t)
+        off = np.linalg.norm(found - uv, axis=1)[tracked]
+        if t == 14:
+            assert (off > 0.5 * pitch).sum() > 10
+    assert (off < 0.5).all()
+    assert tracked[INTERIOR].all()
+    assert not tracker.doubtful

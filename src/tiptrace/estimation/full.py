@@ -131,6 +131,11 @@ class FullEstimator:
             return TipEstimate(self._exposure_ns(pair.stamp_ns), phase, Status.LOST)
         return self._stage_two_step(replace(pair, phase=phase, poses=poses), markers, repeated)
 
+    @property
+    def bewildered(self) -> bool:
+        """Whether markers have been astray for some frames: matching them to dots anew may help."""
+        return self._monitor.bewildered
+
     def use_pause(self) -> None:
         """Do some of what no estimate waits for, between two pairs; estimates do not depend on it."""
         self._reanchoring.advance()

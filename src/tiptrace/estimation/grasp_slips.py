@@ -71,7 +71,9 @@ class Parts:
             for fit, r in zip(self.fits, rows, strict=True)
         ]
         slip = SlipLevels(max(r.slip.kick_m for r in each), max(r.slip.pattern_m for r in each))
-        return replace(each[-1], axial_m=whole.axial_m, start_E=whole.start_E, slip=slip)
+        return replace(
+            each[-1], axial_m=whole.axial_m, start_E=whole.start_E, slip=slip, tilt_rad=whole.tilt_rad
+        )
 
     @property
     def steps(self) -> FloatArray | None:

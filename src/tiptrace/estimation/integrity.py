@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tiptrace.estimation.contact_watch import ContactWatch
-from tiptrace.estimation.integrity_reference import IntegrityConfig, Reference
+from tiptrace.estimation.integrity_reference import IntegrityConfig, Reference, tilt
 from tiptrace.estimation.motion import Motions
 from tiptrace.estimation.slip_detector import SlipDetector
 from tiptrace.types import BoolArray, FloatArray, IntArray
@@ -54,6 +54,7 @@ class Monitor:
         self._same = np.zeros(2, dtype=int)
         self._slip = SlipDetector(config.slip)
         self._watch = ContactWatch(config)
+        self._misfits = 0
         self._landed = config.landing_frames  # frames since the tip touched again
         self._unseen = np.zeros(0, dtype=int)
         self._twisted = 0
@@ -127,10 +128,23 @@ class Monitor:
             jumped=self._jumped(residual_E),
             lost=self._lost(residual_E, ref.rows),
             disagree=self._twisted >= c.twist_frames,
-            misfit=doubtful or float(motions.residual_m[0]) > max(c.misfit_m, c.misfit * ref.residual_m),
+            misfit=doubtful or self._astray(ref, motions),
             in_contact=in_contact,
             axial_m=axial,
         )
+
+    def _astray(self, ref: Reference, motions: Motions) -> bool:
+        """Whether markers fit no rigid motion, or one that no tool makes: all of one pad are a pitch away."""
+        c = self._config
+        loose = float(motions.residual_m[0]) > max(c.misfit_m, c.misfit * ref.residual_m)
+        astray = loose or float(tilt(motions.R, ref.normal_E)[0]) > ref.tilt_rad + c.tilt_beyond_rad
+        self._misfits = self._misfits + 1 if astray else 0
+        return astray
+
+    @property
+    def bewildered(self) -> bool:
+        """Whether the markers have been astray for so long that they had better be matched to dots anew."""
+        return self._misfits % self._config.again_frames == self._config.again_frames - 1
 
     def _lost(self, residual_E: FloatArray, rows: IntArray) -> BoolArray:
         unseen = np.zeros(len(residual_E), dtype=int)

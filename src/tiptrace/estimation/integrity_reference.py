@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from tiptrace.estimation.motion import Motions, TemplateFit
 from tiptrace.estimation.slip_detector import SlipLevels, SlipLimits, slip_levels
+from tiptrace.geometry.transforms import rotation_log
 from tiptrace.types import FloatArray, IntArray
 
 
@@ -27,6 +28,10 @@ class IntegrityConfig(BaseModel):
     # residual of the rigid fit beyond which it is none: in multiples of Stage I's, and at least
     misfit: float = Field(default=4.0, gt=1)
     misfit_m: float = Field(default=1.5e-4, gt=0)
+    tilt_beyond_rad: float = Field(
+        default=0.07, gt=0
+    )  # of the tool across the pads, beyond Stage I's furthest
+    again_frames: int = Field(default=10, ge=1)  # of misfit, after which markers are matched to dots anew
     twist_limit_rad: float = Field(default=0.03, gt=0)  # of one pad's markers against the other's
     twist_frames: int = Field(default=3, ge=1)
     # the tool springs out along its axis when the tip lifts off
@@ -59,6 +64,7 @@ class Reference:
         rows: Markers in use.
         residual_m: 95th percentile of the rigid fit's root mean square residual in the gels' planes; infinite where
             it is not known.
+        tilt_rad: Furthest rotation of the tool about axes along the pads; likewise.
     """
 
     chi2: float
@@ -71,6 +77,13 @@ class Reference:
     slip: SlipLevels
     rows: IntArray
     residual_m: float = math.inf
+    tilt_rad: float = math.inf
+
+
+def tilt(R: FloatArray, normal_E: FloatArray) -> FloatArray:
+    """Angles (T,) of rotations (T, 3, 3) about axes along the pads: one pad's markers against the other's."""
+    w = rotation_log(R)
+    return np.asarray(np.linalg.norm(w - (w @ normal_E)[:, None] * normal_E, axis=1))
 
 
 def reference(
@@ -109,4 +122,5 @@ def reference(
         slip=slip_levels(D, residual, normal_E) if staged else SlipLevels(0.0, 0.0),
         rows=np.flatnonzero(fit.trust > 0),
         residual_m=float(np.percentile(motions.residual_m, 95)),
+        tilt_rad=float(tilt(motions.R, normal_E).max()) if staged else math.inf,
     )

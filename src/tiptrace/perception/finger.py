@@ -95,6 +95,11 @@ class Finger:
         doubtful = isinstance(self._tracker, RegisteredTracker) and self._tracker.doubtful
         return FingerMarkers(x_S, tracked, uv_px, depths.sigma_m, doubtful)
 
+    def match_anew(self) -> None:
+        """Forget whose dots the markers are on, as far as the tracker can."""
+        if isinstance(self._tracker, RegisteredTracker):
+            self._tracker.match_anew()
+
     def _track(self, image: Image) -> tuple[FloatArray, BoolArray]:
         """Positions (n, 2), NaN where lost, and tracked (n,); the first image starts tracker and lifter."""
         if self._tracker is not None:

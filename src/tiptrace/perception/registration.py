@@ -76,6 +76,10 @@ class RegisteredTracker:
         """Whether markers leapt and there is more than one way to tell whose dots are whose since."""
         return self._sure_px is not None
 
+    def match_anew(self) -> None:
+        """Markers may be on others' dots: from the next frames on they are matched to all dots from where they rest."""
+        self._sure_px = self._rest.copy()
+
     @property
     def mask_radius_px(self) -> float:
         """Radius of the discs of :meth:`mask`."""
