@@ -35,14 +35,19 @@ def draw_prior(found: dict[str, Rows], path: Path) -> None:
             own = rows.get(method, [])
             at = [float(r["prior_mm"]) for r in own]
             ax.scatter(
-                at, [float(r["initial_contact_error_mm"]) for r in own], 18, colour, marker, label=label
+                at,
+                [float(r["initial_contact_error_mm"]) for r in own],
+                18,
+                colour,
+                marker=marker,
+                label=label,
             )
         ax.set(
             title=name, xlabel="nominal tip off by [mm]", ylabel="initial contact error [mm]", ylim=(0, None)
         )
         ax.set_xlim(0, None)
         ax.spines[["top", "right"]].set_visible(False)
-    axes[0, 0].legend(frameon=True, loc="upper center")
+    axes[0, -1].legend(loc="upper left")
     figure.tight_layout()
     figure.savefig(path, dpi=130)
     plt.close(figure)
