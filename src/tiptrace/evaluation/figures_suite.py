@@ -198,23 +198,25 @@ def error_distribution(records: Sequence[TrialRecord], metric: str = "trajectory
 def error_budget(budget: Mapping[str, Sequence[TrialRecord]], metric: str = "trajectory_rmse_mm") -> Figure:
     """Error with one disturbance at a time, by method: mean over trials, whisker to the 95th percentile."""
     methods = methods_of([r for records in budget.values() for r in records])
-    figure = style.new_figure(7.2, 1.2 + 0.22 * len(budget) * max(1, len(methods)))
+    figure = style.new_figure(7.2, 1.4 + 0.36 * len(budget))
     ax = figure.subplots()
-    height = 0.8 / max(1, len(methods))
     for k, method in enumerate(methods):
         colour, _ = style.method_style(method, k)
         s = [
             summarise(list(values_by_trial(records, method, metric).values())) for records in budget.values()
         ]
-        y = np.arange(len(budget)) + (k - (len(methods) - 1) / 2) * height
-        ax.barh(y, [x.mean for x in s], height=0.85 * height, color=colour, label=method)
-        ax.hlines(y, [x.mean for x in s], [x.p95 for x in s], color=style.BLACK, lw=0.8)
+        y = np.arange(len(budget)) + 0.7 * ((k + 0.5) / max(1, len(methods)) - 0.5)
+        ax.hlines(y, [x.mean for x in s], [x.p95 for x in s], color=colour, lw=1.0)
+        ax.scatter([x.mean for x in s], y, s=16, color=colour, marker=_MARKS[k % len(_MARKS)], label=method)
     ax.set_yticks(range(len(budget)), list(budget))
     ax.invert_yaxis()
+    for edge in np.arange(len(budget) - 1) + 0.5:
+        ax.axhline(edge, color=style.GREY, lw=0.4)
     ax.grid(visible=False, axis="y")
     ax.set(xlabel=metric_heading(metric))
+    _logarithmic(ax, "x")
     ax.set_title("One disturbance at a time: mean over trials, whisker to the 95th percentile")
-    figure.legend(loc="outside lower center", ncols=len(methods))
+    figure.legend(loc="outside lower center", ncols=3)
     return figure
 
 
