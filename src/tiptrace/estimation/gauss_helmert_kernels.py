@@ -1,4 +1,7 @@
-"""The loops over frames behind ``tip_map_solver.py`` and ``anchor.py``, compiled; the equations are explained there."""
+"""The loops over frames behind ``tip_map_solver.py`` and ``anchor.py``, compiled; the equations are explained there.
+
+``_turn`` stands in ``kernels.py`` too: compiled loops call such of their own module only (``compiled.py``).
+"""
 
 from __future__ import annotations
 

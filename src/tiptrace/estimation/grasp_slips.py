@@ -101,7 +101,7 @@ class Parts:
         return at if gain > config.share * total and rms > config.pattern_m else None
 
     def jump(self, residual: FloatArray, config: GraspSlipConfig) -> int | None:
-        """First frame after the likeliest jump of the resting tip's residuals (T, 3); None between too few frames."""
+        """First frame after the likeliest jump of the resting tip's residuals (T, 3) m; None between too few frames."""
         found = [_best_cut(residual[a:b, None], a, config.least_frames) for a, b in pairwise(self._bounds)]
         gain, at = max(found)
         return at if gain > 0.0 else None

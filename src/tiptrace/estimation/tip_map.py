@@ -9,6 +9,7 @@ correction, eliminated frame by frame (Gauss-Helmert), so that noisy rotations d
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -126,25 +127,9 @@ def solve_tip_map(
     """
     normal = np.array([1.0, 0.0, 0.0]) if normal_E is None else normal_E
     latency = latency or (config.latency_s, config.latency_std_s)
-
-    def make_solver(noise: float) -> Solver:
-        """With frames of so many times the assumed variance."""
-        sigma = {name: noise**0.5 * getattr(config, name) for name in ("pose_sigma_m", "model_sigma_m")}
-        made = Solver(
-            replace(motions, covariance=noise * motions.covariance),
-            hand_at,
-            phase,
-            config.model_copy(update=sigma),
-            latency,
-            prior,
-            normal,
-            steps,
-        )
-        if known is not None:
-            made.expect_map(known.G, known.covariance[G_, G_])
-        return made
-
-    solver = make_solver(1.0)
+    earlier = None if known is None else (known.G, known.covariance[G_, G_])
+    solver_of = partial(Solver, motions, hand_at, phase, config, latency, prior, normal, steps, earlier)
+    solver = solver_of()
     theta = solver.start()
     free = np.ones(solver.size, dtype=bool)
     free[DRIFT] = False
@@ -154,7 +139,7 @@ def solve_tip_map(
     rougher = 1.0
     if solver.map_is_absurd(best) and best.factor > 1.0:  # a tip that did not rest must not bend the map
         rougher = best.factor
-        solver = make_solver(rougher)
+        solver = solver_of(noise=rougher)
         best = solver.solve(theta, free)
     if solver.map_is_absurd(best):
         free[G_] = False

@@ -6,7 +6,7 @@ Unknowns in order: c (3), p (3), G (9, row-major), τ (1), ċ (3).
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -80,10 +80,28 @@ class Solver:
         prior: TipPrior | None,
         normal: FloatArray,
         steps: FloatArray | None = None,
+        known: tuple[FloatArray, FloatArray] | None = None,
+        noise: float = 1.0,
     ) -> None:
+        """Weigh the priors.
+
+        Args:
+            motions: In-grasp motions of T frames.
+            hand_at: Hand poses of the T frames for a latency.
+            phase: (T,) t/T_I − 1.
+            config: Priors and gates.
+            latency: Calibrated (mean, std) in s.
+            prior: Known tip in F_E.
+            normal: (3,) closing axis in F_E.
+            steps: (T, K) −1 before and 0 after each slip.
+            known: G (3, 3) of an earlier solve and its covariance (9, 9), in place of the prior of G.
+            noise: Variance of the frames over the assumed.
+        """
         self._steps = np.zeros((len(phase), 0)) if steps is None else steps
         self.size: int = SIZE + 3 * self._steps.shape[1]
-        self._m, self._hand_at, self._phase, self._config = motions, hand_at, phase, config
+        self._m = replace(motions, covariance=noise * motions.covariance)
+        self._hand_at, self._phase, self._config = hand_at, phase, config
+        self._variance = noise * (config.pose_sigma_m**2 + config.model_sigma_m**2)
         self._shares = np.column_stack([phase, self._steps])  # (T, 1 + K) of drift and steps in c_t
         self._read: tuple[float, HandStates] | None = None
         self._latency, self._prior = latency, prior
@@ -97,7 +115,11 @@ class Solver:
             sigma = (config.drift_normal_sigma_m, config.step_normal_sigma_m)[k > 0]
             self._prior_P[part, part] = config.drift_sigma_m**2 * along + sigma**2 * across
         self._prior_N = np.zeros((self.size, self.size))
-        self._weigh_priors()
+        if known is not None:
+            G, covariance = known
+            self._mean[G_] = G.ravel()
+            self._prior_P[G_, G_] = covariance + _MAP_CHANGE**2 * np.eye(9)
+        self._prior_N[6:, 6:] = np.linalg.inv(self._prior_P[6:, 6:])
         if prior is not None:
             self._mean[C] = prior.c
             self._prior_N[C, C] = np.linalg.inv(prior.covariance)
@@ -117,15 +139,6 @@ class Solver:
         """Where drift and steps stand among the unknowns."""
         return [DRIFT] + [slice(k, k + 3) for k in range(SIZE, self.size, 3)]
 
-    def _weigh_priors(self) -> None:
-        self._prior_N[6:, 6:] = np.linalg.inv(self._prior_P[6:, 6:])
-
-    def expect_map(self, G: FloatArray, covariance: FloatArray) -> None:
-        """Take G (3, 3) and its covariance (9, 9) from an earlier solve as the prior, a little widened."""
-        self._mean[G_] = G.ravel()
-        self._prior_P[G_, G_] = covariance + _MAP_CHANGE**2 * np.eye(9)
-        self._weigh_priors()
-
     def start(self) -> FloatArray:
         """Maximum likelihood with the gel taken at its word and the latency at its prior."""
         T = self._hand(self._latency[0]).T_B_E
@@ -135,7 +148,7 @@ class Solver:
         t = np.einsum("tij,tj->ti", R_BE, self._m.t) + T[:, :3, 3]
         centre = np.einsum("tij,tj->ti", R_BE, self._m.centre) + T[:, :3, 3]
         Sigma = rotate @ self._m.covariance @ np.swapaxes(rotate, 1, 2)
-        Sigma[:, range(3, 6), range(3, 6)] += self._config.pose_sigma_m**2 + self._config.model_sigma_m**2
+        Sigma[:, range(3, 6), range(3, 6)] += self._variance
         point = fixed_point_ml(R_BE @ self._m.R, t, Sigma, centre, prior=self._prior, outliers=True)
         theta = self._mean.copy()
         theta[C], theta[P] = point.c, point.p
@@ -178,7 +191,6 @@ class Solver:
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """A (T, 3, 19), S⁻¹ (T, 3, 3), misclosure (T, 3), lever (T, 3) at the corrected motions."""
         m, hand = self._m, self._hand(float(theta[15]))
-        variance = self._config.pose_sigma_m**2 + self._config.model_sigma_m**2
         return linearise(
             theta,
             delta,
@@ -190,7 +202,7 @@ class Solver:
             m.centre,
             m.covariance,
             self._shares,
-            variance,
+            self._variance,
         )
 
     def _hand(self, latency_s: float) -> HandStates:

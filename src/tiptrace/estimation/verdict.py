@@ -16,7 +16,8 @@ _SLIP = (
     "tool: how far it slipped they cannot show, positions from here on carry a larger covariance"
 )
 _MISFIT = (
-    "the markers are far from moving as one body, as after a pause in which they leapt to their neighbours' places: "
+    "the markers are far from moving as one body, or as one that leans as the tool never did in anchoring, as after a "
+    "pause in which they leapt to their neighbours' places: "
     "positions are not to be relied on until they fit again"
 )
 _LOST = "the tool sprang out along its axis by {:.1f} mm: the tip does not touch"
