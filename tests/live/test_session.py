@@ -146,15 +146,20 @@ class Shown:
 
 
 def run_through_stage_one(path: Path) -> tuple[Bench, LiveSummary]:
-    """Stage I of 110 pairs, the images' way with and not against time, and two seconds more."""
-    bench = Bench(path, seconds=6.0)
+    """Stage I of 3.5 to 4.5 s, the images' way with and not against time, and 1.3 s more."""
+    bench = Bench(path, seconds=6.0, wait_for_mark=True)
+    session = bench.session
 
     def mark(_: Snapshot) -> None:
-        if sum(s.latency_ms is not None for s in bench.seen) == 110:
-            bench.session.advance()
+        played = (time.monotonic() - bench.start) % (2.0 * bench.feed.duration_s)
+        phase = session.phases.phase
+        if (phase is None and 0.2 < played < 1.2) or (phase is Phase.ANCHORING and played > 4.6):
+            session.advance()
+        elif phase is Phase.RECONSTRUCTION and played > 5.9:
+            session.stop()
 
-    bench.session.subscribe(mark)
-    summary = bench.session.run(6.4)
+    session.subscribe(mark)
+    summary = session.run(60)
     bench.close()
     return bench, summary
 
@@ -199,7 +204,7 @@ def test_the_live_estimate_equals_the_offline_one_on_its_recording(
         assert (a.p_B is None) == (b.p_B is None)
         if a.p_B is not None and b.p_B is not None:
             assert np.abs(a.p_B - b.p_B).max() < 1e-9, "a recording keeps rotations as quaternions"
-    assert sum(e.p_B is not None for e in live) > 20
+    assert sum(e.p_B is not None for e in live) > 10
     assert {e.phase for e in live} == {Phase.ANCHORING, Phase.RECONSTRUCTION}
 
 
