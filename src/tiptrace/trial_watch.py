@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
+from tiptrace.estimation.full import FullEstimator
 from tiptrace.estimation.paper import PaperEstimator
 from tiptrace.evaluation.report_data import AnchoringFit, TactileView
 from tiptrace.frames import FrameWatch
 from tiptrace.pipeline import Step
 from tiptrace.tracer import TipTracer
-from tiptrace.types import SIDES, FloatArray, ImageSample, Phase, SensedPair, Side
+from tiptrace.types import SIDES, BoolArray, FloatArray, ImageSample, IntArray, Phase, SensedPair, Side
 
 
 @dataclass
@@ -101,14 +101,15 @@ class TrialWatch:
             )
         return tuple(views)
 
-    def _selected(self, side: Side, count: int) -> np.ndarray[Any, np.dtype[np.bool_]] | None:
+    def _selected(self, side: Side, count: int) -> BoolArray | None:
         assert self.tracer is not None
-        chosen = (
-            self.tracer.estimator.chosen.get(side)
-            if isinstance(self.tracer.estimator, PaperEstimator)
-            else None
-        )
-        return None if chosen is None else np.isin(np.arange(count), chosen)
+        estimator = self.tracer.estimator
+        chosen: dict[Side, IntArray] = {}
+        if isinstance(estimator, PaperEstimator):
+            chosen = estimator.chosen
+        elif isinstance(estimator, FullEstimator) and estimator.anchoring is not None:
+            chosen = estimator.anchoring.chosen
+        return np.isin(np.arange(count), chosen[side]) if chosen else None
 
     def anchoring(self) -> AnchoringFit | None:
         """Residuals of Stage I with the final anchor."""

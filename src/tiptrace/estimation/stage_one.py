@@ -20,7 +20,7 @@ from tiptrace.estimation.pose_track import HandStates, smooth_at
 from tiptrace.estimation.tip_map import TipMap, assumed_tip_map, solve_tip_map
 from tiptrace.estimation.tip_map_config import DRIFT, TAU, C, TipMapConfig
 from tiptrace.geometry.transforms import skew
-from tiptrace.types import BoolArray, FloatArray, PoseSample
+from tiptrace.types import SIDES, BoolArray, FloatArray, IntArray, PoseSample, Side
 
 
 class StageOneConfig(BaseModel):
@@ -55,6 +55,11 @@ class Anchoring:
         if self.hand is None:
             return self.motions.R
         return np.asarray(self.hand.T_B_E[:, :3, :3] @ self.motions.R)
+
+    @property
+    def chosen(self) -> dict[Side, IntArray]:
+        """Indices of the markers in use per finger."""
+        return {side: np.flatnonzero(self.trust[self.fit.pad == pad] > 0.0) for pad, side in enumerate(SIDES)}
 
     def carried_over(self, stamp_ns: int, sigma_m: float = 2e-4) -> Anchoring:
         """The same grasp in a later trial: no more drift, a little less certain."""

@@ -155,8 +155,9 @@ def _draw_markers(ax: Axes, uv: FloatArray, selected: BoolArray) -> None:
         (~selected, 26, _HAIR, 0.9, "tracked"),
         (selected, 46, style.ORANGE, 1.8, "in the fit"),
     ):
-        u, v = uv[group].T
-        ax.scatter(u, v, s=size, facecolors="none", edgecolors=colour, linewidths=width, label=label)
+        if group.any():
+            u, v = uv[group].T
+            ax.scatter(u, v, s=size, facecolors="none", edgecolors=colour, linewidths=width, label=label)
 
 
 def _draw_arrows(ax: Axes, view: TactileView, factor: int) -> None:
