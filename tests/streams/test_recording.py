@@ -205,6 +205,19 @@ def test_a_writer_that_fails_leaves_no_target_but_a_readable_part(
     assert [s.stamp_ns for s in part] == [s.stamp_ns for s in samples[:250] if not isinstance(s, TruthSample)]
 
 
+def test_what_was_synced_can_be_read_before_its_chunk_is_full(tmp_path: Path, samples: list[Sample]) -> None:
+    written = [s for s in samples[:100] if not isinstance(s, TruthSample)]
+    with RecordingWriter(tmp_path / "trial.mcap", rig=make_rig(), chunk_bytes=2**24) as writer:
+        for sample in written[:60]:
+            writer.write(sample)
+        writer.sync({"a": "note"})
+        for sample in written[60:]:
+            writer.write(sample)
+        part = Recording(writer.partial_path)
+        assert [s.stamp_ns for s in part] == [s.stamp_ns for s in written[:60]]
+    assert [s.stamp_ns for s in Recording(writer.path)] == [s.stamp_ns for s in written]
+
+
 def test_the_same_stream_gives_the_same_bytes(tmp_path: Path, stream: ListStream, trial_path: Path) -> None:
     write_recording(tmp_path / "again.mcap", stream, trial={"trajectory": "T3", "seed": 0})
     assert (tmp_path / "again.mcap").read_bytes() == trial_path.read_bytes()

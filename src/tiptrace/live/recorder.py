@@ -20,9 +20,7 @@ from tiptrace.streams.writer import RecordingWriter
 from tiptrace.types import Image, Sample, Side
 
 _SYNC_S = 1.0
-_CHUNK_BYTES = (
-    64 * 1024
-)  # 0.07 s of two cameras: what a crash can cost beyond the last sync; each costs 1 kB of index
+_CHUNK_BYTES = 512 * 1024  # each costs 1 kB of index, held until the end; a sync ends one early
 _QUEUE_BYTES = 64 * 1024 * 1024  # a minute of a disk that stands still
 _POSE_BYTES = 200
 _PATIENCE = 400  # samples that wait for a good time to be written

@@ -153,7 +153,7 @@ class RecordingWriter:
             raise self._refused(error) from None
 
     def sync(self, note: Mapping[str, str] | None = None) -> None:
-        """Put on the disk what was written, up to the last whole chunk; ``note`` is kept as metadata ``sync``.
+        """Put on the disk what was written; ``note`` is kept as metadata ``sync``.
 
         Raises:
             RecordingError: the disk is full.
@@ -162,7 +162,7 @@ class RecordingWriter:
         try:
             if note is not None:
                 self._writer.add_metadata("sync", dict(note))
-            self._file.flush()
+            self._writer._writer.flush()  # ends the chunk, too; the ROS 2 writer does not pass it on
             os.fsync(self._file.fileno())
         except OSError as error:
             raise self._refused(error) from None
