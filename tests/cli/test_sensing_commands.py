@@ -67,6 +67,25 @@ def test_outputs_that_cannot_be_written_are_told_before_the_work(video: Path, tm
     assert (tmp_path / "file").read_text() == ""
 
 
+def test_track_does_not_write_over_its_video(video: Path, tmp_path: Path) -> None:
+    before = video.read_bytes()
+    with pytest.raises(OutputError, match="the video itself"):
+        track(video, out=video)
+    with pytest.raises(OutputError, match="the video itself"):
+        track(video, out=tmp_path / "tracks.csv", overlay=video)
+    with pytest.raises(OutputError, match="is --out"):
+        track(video, out=tmp_path / "tracks.mp4", overlay=tmp_path / "tracks.mp4")
+    assert video.read_bytes() == before
+
+
+def test_tracks_that_fail_leave_the_former_table(video: Path, tmp_path: Path) -> None:
+    (tmp_path / "tracks.csv").write_text("before")
+    with pytest.raises(OutputError, match=r"ends in \.mp4"):
+        track(video, out=tmp_path / "tracks.csv", overlay=tmp_path / "tracks.txt")
+    assert (tmp_path / "tracks.csv").read_text() == "before"
+    assert not list(tmp_path.glob(".tracks*"))
+
+
 def test_depth_takes_the_scale_of_the_gel_model(renderer: TactileRenderer, tmp_path: Path) -> None:
     press = render_press(renderer, (160.0, 120.0), ball_diameter_m=6e-3, depth_m=0.6e-3)
     cv2.imwrite(str(tmp_path / "press.png"), press.image)
@@ -94,6 +113,18 @@ def test_check_says_what_is_missing_and_fails_on_wear(renderer: TactileRenderer,
     calibrate_check([reference], reference=reference, gel="gelsight-mini-virtual")
     with pytest.raises(typer.Exit):
         calibrate_check([dim], reference=reference, gel="gelsight-mini-virtual")
+
+
+def test_wear_that_a_contact_may_feign_is_told_so(
+    renderer: TactileRenderer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    reference, pressed = tmp_path / "reference.png", tmp_path / "pressed.png"
+    cv2.imwrite(str(reference), renderer.reference())
+    press = render_press(renderer, (160.0, 120.0), ball_diameter_m=6e-3, depth_m=0.6e-3)
+    cv2.imwrite(str(pressed), (press.image * 0.7).astype(np.uint8))
+    with pytest.raises(typer.Exit):
+        calibrate_check([pressed], reference=reference, gel="gelsight-mini-virtual")
+    assert "check an image without contact" in capsys.readouterr().out
 
 
 def test_a_video_without_markers_or_no_video_is_refused(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ import yaml
 
 from tests.sim.helpers import short_spec
 from tiptrace.config import dump_yaml
-from tiptrace.errors import SimulationError
+from tiptrace.errors import OutputError, SimulationError
 from tiptrace.geometry.transforms import rotation_log
 from tiptrace.sim.disturbances import LEVELS, Disturbances, MarkerNoise
 from tiptrace.sim.simulation import START_NS, Frame
@@ -299,6 +299,14 @@ def test_suite_resumes_and_refuses_another_suites_folder(tmp_path: Path) -> None
     other = [SuiteTrial("t0", tiny(seed=9, travel_m=0.0, anchoring_s=0.4))]
     with pytest.raises(SimulationError, match="other settings"):
         list(write_suite(other, tmp_path))
+    before = (tmp_path / "t0.mcap").read_bytes()
+    with pytest.raises(
+        SimulationError, match="other settings"
+    ):  # also where the table of its truth is missing
+        list(write_suite(other, tmp_path, truth=True))
+    assert (tmp_path / "t0.mcap").read_bytes() == before
+    with pytest.raises(OutputError, match="cannot be a folder"):
+        list(write_suite(trials, tmp_path / "t0.mcap"))
 
 
 @pytest.mark.slow

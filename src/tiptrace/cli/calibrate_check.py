@@ -108,5 +108,10 @@ def calibrate_check(
     Console().print(table)
     for label, remedy in advice.items():
         typer.echo(f"{label}: {remedy}")
+    if advice and any(s.touched for s in scores):
+        typer.echo(
+            "something touches the gel, which hides dots and bends what lies around: check an image without contact "
+            "before you replace anything"
+        )
     if worn:
         raise typer.Exit(1)

@@ -89,14 +89,17 @@ def _one(values: dict[str, Any], out: Path, truth: Path | None) -> None:
     from rich.console import Console
     from rich.progress import Progress
 
+    from tiptrace.errors import OutputError
     from tiptrace.sim.spec import make_spec
     from tiptrace.streams.simulated_files import write_trial
 
+    if out.is_dir():
+        raise OutputError(f"{out}: is a folder; give the recording a name, e.g. --out {out / 'trial.mcap'}")
     spec = make_spec(**values)
     with Progress(console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task(f"simulating {spec.name}", total=_expected_frames(spec))
         frames = write_trial(spec, out, truth, lambda: progress.advance(task))
-    console = Console(highlight=False, soft_wrap=True)
+    console = Console(highlight=False, markup=False, soft_wrap=True)
     console.print(f"{out}: {spec.name}, {frames} frames, {spec.mode}, level {spec.level}, seed {spec.seed}")
     if truth is not None:
         console.print(f"{truth}: the truth of every frame")
@@ -129,7 +132,7 @@ def _suite(suite: str, values: dict[str, Any], out: Path, workers: int, truth: b
             progress.advance(task)
             if done.error is not None:
                 failed.append(done)
-    console = Console(highlight=False, soft_wrap=True)
+    console = Console(highlight=False, markup=False, soft_wrap=True)
     console.print(f"{out}: {len(trials) - len(failed)} of {len(trials)} trials")
     if failed:
         raise SimulationError("; ".join(f"{f.name}: {f.error}" for f in failed))

@@ -49,15 +49,24 @@ def track(
     """
     from tiptrace.cli.files import check_writable
     from tiptrace.cli.show import progress_bar
+    from tiptrace.errors import OutputError
     from tiptrace.perception.planar import MotionPatch
     from tiptrace.perception.video import Video
 
     source = Video(video)
+    taken = {video.resolve(): "the video itself"}
+    for path, what in ((out, "--out"), (overlay, "--overlay")):
+        if path is not None and (other := taken.setdefault(path.resolve(), what)) != what:
+            raise OutputError(f"{what} {path}: is {other}; choose another name")
     for path in (out,) if overlay is None else (out, overlay):
         check_writable(path)
     with ExitStack() as stack:
         progress = stack.enter_context(progress_bar())
-        table = stack.enter_context(out.open("w", newline="\n"))
+        whole = not out.is_symlink() and (out.is_file() or not out.exists())  # no device, as /dev/stdout
+        unfinished = out.with_name(f".{out.name}.part") if whole else out
+        if whole:  # a run that is stopped leaves no half of a table
+            stack.callback(unfinished.unlink, missing_ok=True)
+        table = stack.enter_context(unfinished.open("w", newline="\n"))
         table.write("frame,marker,u_px,v_px,status" + (",patch" if patch else "") + "\n")
         task = progress.add_task(f"tracking {video.name}", total=source.frame_count or None)
         drawing = None if overlay is None else stack.enter_context(_Overlay(overlay, source.fps))
@@ -72,6 +81,9 @@ def track(
                 drawing.add(frame)
             frames, markers, lost = frame.index + 1, len(frame.uv_px), int((~frame.tracked).sum())
             progress.advance(task)
+        table.close()
+        if whole:
+            unfinished.replace(out)
     typer.echo(f"{out}: {markers} markers in {frames} frames, {lost} lost at the end")
 
 

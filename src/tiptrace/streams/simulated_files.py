@@ -8,7 +8,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 
-from tiptrace.errors import SimulationError, TipTraceError
+from tiptrace.errors import OutputError, SimulationError, TipTraceError
 from tiptrace.sim.spec import TrialSpec
 from tiptrace.sim.suite import SuiteTrial
 from tiptrace.streams.recording import Recording
@@ -69,14 +69,21 @@ def write_suite(
 
     Raises:
         SimulationError: a file of that name holds another trial.
+        OutputError: the folder cannot be made.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(
+            f"{folder}: cannot be a folder for the trials ({error.strerror}); choose another"
+        ) from None
     todo: list[tuple[SuiteTrial, Path, Path | None]] = []
     for trial in trials:
         path = folder / f"{trial.name}.mcap"
         table = folder / f"{trial.name}.truth.parquet" if truth else None
+        if path.exists():
+            _check_same(trial, path)  # also where only the table is missing: the recording is written again
         if path.exists() and (table is None or table.exists()):
-            _check_same(trial, path)
             yield WrittenTrial(trial.name, path)
         else:
             todo.append((trial, path, table))
