@@ -13,16 +13,19 @@ import pytest
 from tiptrace import batch
 from tiptrace.batch import BatchResult, BatchSettings, run_batch
 from tiptrace.batch_plan import find_recordings
+from tiptrace.config import dump_yaml
 from tiptrace.errors import ConfigError
 from tiptrace.evaluation.executors import OpenExecutor, SerialExecutor
 from tiptrace.evaluation.runner import TrialRun, TrialTask
 from tiptrace.frames import FRAMES, read_frames
+from tiptrace.grasp_file import GRASP
 from tiptrace.outputs import CSV, read_csv
 from tiptrace.reconstruction import reconstruct
 from tiptrace.sim.spec import make_spec
 from tiptrace.streams.recording import Recording
 from tiptrace.streams.simulated import SimulatedStream
 from tiptrace.streams.writer import write_recording
+from tiptrace.using import Using
 
 PAPER = BatchSettings("paper")
 
@@ -146,6 +149,28 @@ def test_results_of_other_settings_are_not_mixed(recordings: Path, tmp_path: Pat
     run(recordings, tmp_path, shard=(1, 3))
     with pytest.raises(ConfigError, match="other settings"):
         run(recordings, tmp_path, BatchSettings("full"), shard=(2, 3))
+
+
+def test_an_edited_rig_is_another(recordings: Path, tmp_path: Path) -> None:
+    rig = tmp_path / "rig.yaml"
+    rig.write_text(dump_yaml(Recording(recordings / "a.mcap").rig))
+    settings = BatchSettings("paper", options={"rig": str(rig)})
+    run(recordings, tmp_path / "out", settings, shard=(1, 3))
+    assert run(recordings, tmp_path / "out", settings, shard=(1, 3)).kept == 1
+    rig.write_text(rig.read_text() + "# edited\n")
+    with pytest.raises(ConfigError, match=r"other settings \(rig .* → .*\)"):
+        run(recordings, tmp_path / "out", settings, shard=(1, 3))
+
+
+def test_a_tip_or_a_grasp_of_other_content_is_another(tmp_path: Path) -> None:
+    tool, results = tmp_path / "tool.yaml", tmp_path / "results"
+    results.mkdir()
+    for using, file in ((Using(tip=tool), tool), (Using(anchor_from=results), results / GRASP)):
+        claims = []
+        for text in ("a", "a", "b"):
+            file.write_text(text)
+            claims.append(BatchSettings(using=using).claim())
+        assert claims[0] == claims[1] != claims[2]
 
 
 def test_without_pyarrow_the_table_is_csv(

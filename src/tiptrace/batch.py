@@ -22,6 +22,7 @@ from tiptrace.batch_plan import NamedPath, share
 from tiptrace.errors import OutputError
 from tiptrace.evaluation.atomic import write_atomic
 from tiptrace.evaluation.executors import OpenExecutor, local_executor
+from tiptrace.evaluation.inputs import file_state, with_content
 from tiptrace.evaluation.records import TrialRecord, from_row, to_row
 from tiptrace.evaluation.runner import SuiteRun, TrialRun, TrialTask
 from tiptrace.evaluation.suite_store import SuiteStore
@@ -59,9 +60,14 @@ class BatchSettings:
     using: Using = field(default_factory=Using)
 
     def claim(self) -> dict[str, str]:
-        """What results in the same folder must have in common."""
+        """What results in the same folder must have in common; an edited rig.yaml is another."""
         common = {"method": self.method, "beside": ",".join(self.beside), "report": str(self.report)}
-        given = {**(self.options or {}), **self.using.as_text()}
+        given = {k: v if k in _PLAIN_OPTIONS else with_content(v) for k, v in (self.options or {}).items()}
+        given |= self.using.as_text()
+        if self.using.tip is not None:
+            given["tip"] = with_content(self.using.tip)
+        if (other := self.using.anchor_from) is not None:
+            given["anchor_from"] = with_content(other, other / GRASP if other.is_dir() else None)
         return {"batch": "reconstruct", **common, **given, "tiptrace": tiptrace.__version__}
 
 
@@ -182,12 +188,12 @@ class BatchStore(SuiteStore):
             record = replace(record, report=f"{trial}/{_REPORT}")
         row = {"recording": str(path), **to_row(record), "reasons": "; ".join(reasons)}
         row = {name: value for name, value in row.items() if not name.startswith("analytic_")}
-        write_atomic(folder / SUMMARY, json.dumps({"state": _state(path), "row": row}, indent=1) + "\n")
+        write_atomic(folder / SUMMARY, json.dumps({"state": file_state(path), "row": row}, indent=1) + "\n")
 
     def read(self, trial: str) -> list[TrialRecord] | None:
         """The row of a recording; None where it is not done, or where the file has changed since."""
         found = self._load(trial)
-        if found is None or found["state"] != _state(self._paths[trial]):
+        if found is None or found["state"] != file_state(self._paths[trial]):
             return None
         try:
             return [from_row(_Known(found["row"]))]
@@ -233,16 +239,6 @@ class _Known(dict[str, Any]):
     def __missing__(self, name: str) -> None:
         if not name.startswith("analytic_"):
             raise KeyError(name)
-
-
-def _state(path: Path) -> list[int]:
-    """Size and time of change, of a bag over all its files; tells whether a recording is still the same."""
-    files = sorted(f for f in path.rglob("*") if f.is_file()) if path.is_dir() else [path]
-    try:
-        stats = [f.stat() for f in files]
-    except OSError:
-        return []
-    return [sum(s.st_size for s in stats), max((s.st_mtime_ns for s in stats), default=0)]
 
 
 def _task(item: NamedPath, settings: BatchSettings, out: Path) -> TrialTask:

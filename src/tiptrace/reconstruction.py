@@ -18,7 +18,7 @@ from tiptrace.estimation.smoothing import Recorded, smooth
 from tiptrace.evaluation.metrics import TrialMetrics, evaluate
 from tiptrace.evaluation.quality import Quality, assess
 from tiptrace.evaluation.report_data import MethodResult, ReportData
-from tiptrace.evaluation.trial_report import write_trial_report
+from tiptrace.evaluation.trial_report import REPORT, write_trial_report
 from tiptrace.evaluation.truth import Truth
 from tiptrace.frames import write_frames
 from tiptrace.grasp_file import GRASP, write_grasp
@@ -123,6 +123,7 @@ def reconstruct(
     write_frames(out, watch.frames.stamps)
     _keep_grasp(out, traced, stream)
     page = None
+    (out / REPORT).unlink(missing_ok=True)  # of another run
     if report:
         data = ReportData(
             title=title,

@@ -110,7 +110,12 @@ def recording_tasks(
     tasks = []
     for path in found:
         curve = {"centreline": analytic, "start_m": start_m} if analytic else None
-        tasks.append(TrialTask(str(path), recording_source(path, _truth_of(path, truth), curve, options)))
+        own = _truth_of(path, truth)
+        if truth is not None and own is None:
+            notes.append(
+                f"{path}: no {path.stem}.tum or .csv in {truth}; what the recording itself holds counts"
+            )
+        tasks.append(TrialTask(str(path), recording_source(path, own, curve, options)))
     return tasks, notes
 
 

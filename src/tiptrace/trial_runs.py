@@ -94,6 +94,16 @@ def recording_source(
     return json.dumps(values, sort_keys=True)
 
 
+def inputs_of(task: TrialTask) -> tuple[Path, ...]:
+    """Files that a trial comes from; none of a simulated one."""
+    source = json.loads(task.source)
+    if "spec" in source:
+        return ()
+    path = Path(source["path"])
+    truth = (Path(source["truth"]),) if source.get("truth") else ()
+    return (path, truth_table_of(path), *truth)
+
+
 def _open(source: dict[str, Any]) -> tuple[Trial, TrueEvents | None]:
     """The trial of a source, and what really happened in it, where that is known."""
     if "spec" in source:

@@ -13,6 +13,7 @@ from typer.testing import CliRunner, Result
 from tiptrace.cli.evaluate import evaluate
 from tiptrace.cli.simulate import simulate
 from tiptrace.errors import ConfigError
+from tiptrace.evaluation.suite_store import file_name
 from tiptrace.streams.recording import Recording
 from tiptrace.tracer import METHODS
 
@@ -86,6 +87,40 @@ def test_wrong_requests_are_refused(arguments: tuple[str, ...], words: str, tmp_
     result = run(*arguments, "--out", tmp_path / "out", "--analytic", "T1")
     assert isinstance(result.exception, ConfigError)
     assert words in str(result.exception)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("x.mcap", "--analytic", "T9"), "unknown centreline 'T9'; valid: auto, T1"),
+        (("x.mcap", "--start", "0.4,-0.1,0.02"), "give --analytic"),
+        (("--suite", "quick", "--truth", "mocap.tum"), "--truth: a simulated suite has its own"),
+    ],
+)
+def test_what_no_trial_can_use_is_refused_before_the_work(
+    arguments: tuple[str, ...], words: str, tmp_path: Path
+):
+    result = run(*arguments, "--out", tmp_path / "out")
+    assert isinstance(result.exception, ConfigError)
+    assert words in str(result.exception)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_recording_that_was_replaced_is_evaluated_again(recording: Path, tmp_path: Path):
+    mine, out = tmp_path / "mine.mcap", tmp_path / "out"
+    arguments = (mine, "--methods", "ee-only", "--workers", 1, "--out", out)
+    mine.write_bytes(recording.read_bytes())
+    assert run(*arguments).exit_code == 0
+    page = out / "outliers" / file_name(str(mine)) / "report.html"
+    page.parent.mkdir(parents=True)
+    page.write_text("old")
+    assert run(*arguments).exit_code == 0
+    assert page.read_text() == "old"  # nothing is done twice
+    mine.write_text("no recording any more")
+    result = run(*arguments)
+    assert result.exit_code == 1
+    assert "is not an MCAP file" in " ".join(result.output.split())
+    assert not page.exists()
 
 
 def test_a_folder_without_recordings_is_refused(tmp_path: Path):

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tiptrace.errors import ConfigError
+from tiptrace.errors import ConfigError, OutputError
 from tiptrace.evaluation.conditions import Condition
 from tiptrace.evaluation.executors import SerialExecutor, local_executor
 from tiptrace.evaluation.records import TrialRecord, to_row
@@ -113,6 +113,25 @@ def test_a_folder_keeps_to_its_settings(tmp_path: Path):
     store.claim({"level": "nominal", "methods": "paper"})
     with pytest.raises(ConfigError, match="level nominal → hard"):
         store.claim({"level": "hard", "methods": "paper"})
+
+
+def test_settings_that_cannot_be_read_are_told(tmp_path: Path):
+    (tmp_path / "suite.json").write_text("")
+    with pytest.raises(OutputError, match="does not tell which settings"):
+        SuiteStore(tmp_path).claim({"level": "nominal"})
+
+
+def test_a_trial_whose_file_has_changed_is_not_finished(tmp_path: Path):
+    file = tmp_path / "trial.mcap"
+    file.write_text("before")
+    (task,) = tasks(1)
+    out = tmp_path / "out"
+    store = SuiteStore(out, {task.name: [file]})
+    assert store.read(task.name) is None
+    SuiteRun(run_straight, ["first"], store, SerialExecutor).run([task])
+    assert SuiteStore(out, {task.name: [file]}).read(task.name) is not None
+    file.write_text("another trial")
+    assert SuiteStore(out, {task.name: [file]}).read(task.name) is None
 
 
 def test_traces_come_back_with_their_condition(tmp_path: Path):

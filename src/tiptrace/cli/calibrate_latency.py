@@ -39,6 +39,7 @@ def calibrate_latency(
     """
     from tiptrace.calibration.latency import calibrate_latency as solve
     from tiptrace.calibration.latency import rig_with_latency
+    from tiptrace.cli.files import check_writable
     from tiptrace.cli.show import progress_bar
     from tiptrace.config import dump_yaml
     from tiptrace.evaluation.atomic import write_atomic
@@ -55,6 +56,8 @@ def calibrate_latency(
         reference_right=reference_right,
         reference_frames=reference_frames,
     )
+    if out is not None:
+        check_writable(out)
     sensing = Sensing(stream, SensingConfig(depth=depth))
     with progress_bar() as progress:
         task = progress.add_task(f"sensing {recording.name}", total=None)

@@ -45,6 +45,7 @@ def calibrate_rig(
       tiptrace calibrate rig wiggle1.mcap wiggle2.mcap --rig old.yaml --reference-frames 0:20 --out rig.yaml
     """
     from tiptrace.calibration.rig import calibrate_rig as solve
+    from tiptrace.cli.files import check_writable
     from tiptrace.cli.show import progress_bar
     from tiptrace.config import dump_yaml
     from tiptrace.evaluation.atomic import write_atomic
@@ -57,6 +58,8 @@ def calibrate_rig(
         "reference_right": reference_right,
         "reference_frames": reference_frames,
     }
+    if out is not None:
+        check_writable(out)
     segments, believed = [], None
     with progress_bar() as progress:
         for path in wiggles:

@@ -77,16 +77,23 @@ def evaluate(
     from rich.console import Console
 
     from tiptrace.errors import ConfigError
+    from tiptrace.evaluation.inputs import with_content
     from tiptrace.evaluation.suite_store import SuiteStore
     from tiptrace.evaluation.suite_values import without_truth
     from tiptrace.evaluation.versions import library_versions
     from tiptrace.trial_plan import recording_tasks, suite_tasks
+    from tiptrace.trial_runs import inputs_of
 
-    names = [m.strip() for m in methods.split(",") if m.strip()]
+    names = list(dict.fromkeys(m.strip() for m in methods.split(",") if m.strip()))
     _check_methods(names)
     if bool(paths) == bool(suite):
         raise ConfigError("give recordings, or --suite paper|quick; not both, not neither")
-    console, store = Console(), SuiteStore(out)
+    _check_curve(analytic, start)
+    own = {"--truth": truth, "--map": map_file, "--rig": rig, "--reference-frames": reference_frames}
+    if suite and any(own.values()):
+        ours = ", ".join(name for name, value in own.items() if value)
+        raise ConfigError(f"{ours}: a simulated suite has its own; leave it out, or give recordings")
+    console = Console()
     settings = {"methods": ",".join(names), "analytic": analytic or "", "start": start or ""}
     if suite:
         tasks = suite_tasks(suite, level, mode, seed, analytic)
@@ -94,12 +101,17 @@ def evaluate(
     else:
         given = {"map_file": map_file, "rig": rig, "reference_frames": reference_frames}
         options = {key: str(value) for key, value in given.items() if value is not None}
-        settings |= {"truth": str(truth or ""), **options}
+        known = {k: v if k == "reference_frames" else with_content(v) for k, v in options.items()}
+        settings |= {"truth": str(truth or ""), **known}
         tasks, notes = recording_tasks(paths or [], truth, analytic, _start(start), options)
         for note in notes:
             console.print(f"note: {note}", highlight=False, markup=False)
+    store = SuiteStore(out, {task.name: inputs_of(task) for task in tasks})
     store.claim({**settings, "tiptrace": library_versions().get("tiptrace", "")})
     workers = workers or os.cpu_count() or 1
+    for task in tasks:
+        if store.read(task.name) is None:
+            _outlier_page(store, task).unlink(missing_ok=True)
     records = _run(tasks, names, store, workers, scheduler)
     records = _report_outliers(tasks, names, store, records)
     found = _run_budget(level, seed, budget, names, store, workers, scheduler)
@@ -115,6 +127,17 @@ def _check_methods(names: list[str]) -> None:
     unknown = [m for m in names if m not in METHODS]
     if unknown or not names:
         raise ConfigError(f"unknown method(s) {', '.join(unknown) or '–'}; valid: {', '.join(METHODS)}")
+
+
+def _check_curve(analytic: str | None, start: str | None) -> None:
+    """Before any work: a name that no trial can use would cost them all."""
+    from tiptrace.errors import ConfigError
+    from tiptrace.evaluation.analytic import CENTRELINES
+
+    if analytic is not None and analytic not in ("auto", *CENTRELINES):
+        raise ConfigError(f"unknown centreline '{analytic}'; valid: auto, {', '.join(CENTRELINES)}")
+    if start is not None and analytic is None:
+        raise ConfigError("--start is the start of an analytic centreline: give --analytic, too")
 
 
 def _start(text: str | None) -> list[float] | None:
@@ -188,7 +211,6 @@ def _report_outliers(
 
     from tiptrace.cli.show import progress_bar
     from tiptrace.errors import TipTraceError
-    from tiptrace.evaluation.suite_store import file_name
     from tiptrace.evaluation.suite_values import outliers
     from tiptrace.trial_runs import report_trial
 
@@ -196,12 +218,17 @@ def _report_outliers(
     links: dict[str, str] = {}
     with progress_bar() as progress:
         for task in progress.track([t for t in tasks if t.name in worst], description="reports of outliers"):
-            folder = store.folder / "outliers" / file_name(task.name)
-            page = folder / "report.html"
+            page = _outlier_page(store, task)
             with suppress(TipTraceError):  # it is in the table of failures
-                if page.exists() or report_trial(task, methods, folder) is not None:
+                if page.exists() or report_trial(task, methods, page.parent) is not None:
                     links[task.name] = str(page.relative_to(store.folder))
     return [replace(r, report=links.get(r.trial, "")) for r in records]
+
+
+def _outlier_page(store: SuiteStore, task: TrialTask) -> Path:
+    from tiptrace.evaluation.suite_store import file_name
+
+    return store.folder / "outliers" / file_name(task.name) / "report.html"
 
 
 def _report(

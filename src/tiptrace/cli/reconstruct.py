@@ -88,7 +88,13 @@ def reconstruct(
     again, what fails is listed and the rest goes on (exit code 1).
     """
     from tiptrace.batch_plan import is_batch
+    from tiptrace.errors import ConfigError
+    from tiptrace.tracer import METHODS
     from tiptrace.using import Using
+
+    for name in (method, *(beside or ())):
+        if name not in METHODS:
+            raise ConfigError(f"unknown method '{name}'; valid: {', '.join(METHODS)}")
 
     using = Using(tip, anchor_from, regrasp, regrasp_sigma_mm * 1e-3, relative, depth, smooth)
     options: dict[str, Any] = {
@@ -120,11 +126,14 @@ def _single(
     options: dict[str, Any],
     using: Using,
 ) -> None:
+    from tiptrace.cli.files import check_writable
     from tiptrace.cli.show import print_results, progress_bar
+    from tiptrace.outputs import CSV
     from tiptrace.reconstruction import reconstruct as run
     from tiptrace.streams.sources import open_recording
 
     stream = open_recording(recording, **options)
+    check_writable(out / CSV)
     with progress_bar() as progress:
         task = progress.add_task(f"reconstructing {recording.name}", total=None)
         result = run(

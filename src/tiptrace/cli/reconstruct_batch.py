@@ -22,12 +22,7 @@ def reconstruct_batch(
     from tiptrace.batch import run_batch
     from tiptrace.batch_plan import find_recordings, parse_shard, share
     from tiptrace.cli.show import progress_bar
-    from tiptrace.errors import ConfigError
-    from tiptrace.tracer import METHODS
 
-    for method in (settings.method, *settings.beside):
-        if method not in METHODS:
-            raise ConfigError(f"unknown method '{method}'; valid: {', '.join(METHODS)}")
     part = parse_shard(shard) if shard else (1, 1)
     found = find_recordings(paths, bags="map_file" in (settings.options or {}))
     console = Console(highlight=False, markup=False, soft_wrap=True)

@@ -5,13 +5,14 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
 from tiptrace.errors import ConfigError, OutputError
 from tiptrace.evaluation.atomic import write_atomic
 from tiptrace.evaluation.conditions import Condition
+from tiptrace.evaluation.inputs import file_states
 from tiptrace.evaluation.records import TrialRecord, read_records, write_records
 from tiptrace.evaluation.traces import TrialTraces
 
@@ -26,13 +27,20 @@ class SuiteStore:
         DIR/
           suite.json            what the suite was set to
           records/TRIAL.parquet a row per method (.csv without pyarrow)
+          records/TRIAL.json    size and time of the files that they come from, where there are any
           traces/TRIAL.npz      positions for the figures
           trials.parquet        all records, written at the end
     """
 
-    def __init__(self, folder: Path) -> None:
-        """Use a folder; nothing is written yet."""
+    def __init__(self, folder: Path, inputs: Mapping[str, Sequence[Path]] | None = None) -> None:
+        """Use a folder; nothing is written yet.
+
+        Args:
+            folder: Where.
+            inputs: Files that trials come from; a trial whose files have changed is not finished.
+        """
         self.folder = folder
+        self._inputs = inputs or {}
         self._suffix = ".parquet" if find_spec("pyarrow") else ".csv"
 
     def claim(self, settings: Mapping[str, str]) -> None:
@@ -44,7 +52,7 @@ class SuiteStore:
         """
         path = self.folder / _SETTINGS
         if path.exists():
-            before = json.loads(path.read_text(encoding="utf-8"))
+            before = _load_settings(path)
             other = sorted(k for k in {*before, *settings} if before.get(k) != settings.get(k))
             if other:
                 changes = ", ".join(f"{k} {before.get(k, '–')} → {settings.get(k, '–')}" for k in other)
@@ -58,11 +66,15 @@ class SuiteStore:
         """Keep a finished trial; its records come last, so that they mean that all of it is there."""
         if traces is not None:
             traces.write(self._path("traces", trial, ".npz"))
+        if inputs := self._inputs.get(trial):
+            write_atomic(self._path("records", trial, ".json"), json.dumps(file_states(inputs)) + "\n")
         write_records(self._path("records", trial, self._suffix), records)
 
     def read(self, trial: str) -> list[TrialRecord] | None:
-        """Records of a trial; None where it is not finished or its file is damaged."""
+        """Records of a trial; None where it is not finished, its files have changed, or the record is damaged."""
         path = self._path("records", trial, self._suffix)
+        if not self._unchanged(trial):
+            return None
         try:
             return read_records(path) if path.exists() else None
         except OutputError:
@@ -82,8 +94,31 @@ class SuiteStore:
         write_records(path, records)
         return path
 
+    def _unchanged(self, trial: str) -> bool:
+        """Whether the files that a trial comes from are those that its records were made from."""
+        inputs = self._inputs.get(trial)
+        if not inputs:
+            return True
+        try:
+            before = json.loads(self._path("records", trial, ".json").read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            return False
+        return bool(before == file_states(inputs))
+
     def _path(self, kind: str, trial: str, suffix: str) -> Path:
         return self.folder / kind / f"{file_name(trial)}{suffix}"
+
+
+def _load_settings(path: Path) -> dict[str, str]:
+    try:
+        before = json.loads(path.read_text(encoding="utf-8"))
+        if isinstance(before, dict):
+            return before
+    except (OSError, ValueError):
+        pass
+    raise OutputError(
+        f"{path}: does not tell which settings the results beside it have; choose another --out"
+    )
 
 
 def file_name(trial: str) -> str:

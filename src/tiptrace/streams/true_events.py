@@ -35,7 +35,8 @@ class TrueEvents:
 
 def truth_table_of(recording: Path) -> Path:
     """Where ``tiptrace simulate --suite … --truth`` leaves the truth of a recording's frames."""
-    return recording.with_name(f"{recording.stem}.truth.parquet")
+    whole = recording.absolute()  # `.` has no name
+    return whole.with_name(f"{whole.stem}.truth.parquet")
 
 
 def from_frames(frames: Sequence[Frame]) -> TrueEvents:
