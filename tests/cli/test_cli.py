@@ -90,11 +90,37 @@ def test_truth_and_trial_metadata_do_not_reach_the_method(run, trial: Path, tmp_
     np.testing.assert_allclose(a, b, atol=1e-9)  # poses are written once more, hence not to the last bit
 
 
+def test_names_with_brackets_and_blanks_are_shown_whole(run, trial: Path, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    odd = tmp_path / "of [today]" / "my trial.mcap"
+    odd.parent.mkdir()
+    odd.write_bytes(trial.read_bytes())
+    code, text = run("inspect", odd)
+    assert code == 0
+    assert f"tiptrace reconstruct '{odd}' --out results" in text.replace("\n", "")
+    for name in ("a [x]", "b [x]"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "report.html").write_text("of another run")
+        code, _ = run("reconstruct", odd, "--out", tmp_path / name, "--method", "ee-only", "--no-report")
+        assert code == 0
+        assert not (tmp_path / name / "report.html").exists()
+    code, text = run("compare", tmp_path / "a [x]", tmp_path / "b [x]")
+    assert code == 0
+    assert "nan" not in text
+    assert "[x]" in text
+
+
 BAD = {
     "no file": (("reconstruct", "none.mcap"), "none.mcap"),
     "no such method": (("reconstruct", "{trial}", "--method", "best"), "unknown method 'best'; valid: "),
     "no such trajectory": (("simulate", "--trajectory", "T9", "--out", "{tmp}/t.mcap"), "T1"),
     "poses missing": (("calibrate", "tip", "none.csv"), "none.csv: cannot be read"),
+    "no such method beside": (
+        ("reconstruct", "{trial}", "--beside", "best"),
+        "unknown method 'best'; valid: ",
+    ),
+    "a file as results": (("reconstruct", "{trial}", "--out", "{tmp}/text.mcap"), "cannot be written"),
+    "a folder as a recording": (("simulate", "--out", "{tmp}"), "is a folder"),
+    "a repeat of itself": (("compare", "{tmp}", "{tmp}/../{tmp.name}"), "more than once"),
     "not a recording": (("inspect", "{tmp}/text.mcap"), "text.mcap"),
 }
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -170,6 +171,17 @@ def test_an_episode_that_fails_is_listed_and_left_out(recordings: Path, tmp_path
     assert done.exit_code == 1
     assert "failed: bad: " in done.output
     assert [e["name"] for e in parquet(tmp_path / "tip.parquet")[1]["episodes"]] == ["t1"]
+
+
+def test_recordings_beside_results_are_not_left_out_in_silence(results: Path, tmp_path: Path) -> None:
+    shutil.copytree(results, tmp_path / "mixed")
+    (tmp_path / "mixed" / "new.mcap").write_bytes(b"")
+    sources, failures, notes = find_sources([tmp_path / "mixed"])
+    assert sources
+    assert all(s.results for s in sources)
+    assert failures == []
+    assert len(notes) == 1
+    assert "1 recording(s) beside them are not" in notes[0]
 
 
 def test_results_without_stamps_say_what_to_do(results: Path, tmp_path: Path) -> None:

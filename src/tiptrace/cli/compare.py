@@ -29,6 +29,7 @@ def compare(
     """
     import numpy as np
     from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
 
     from tiptrace.errors import ConfigError
@@ -36,7 +37,17 @@ def compare(
 
     if len(results) < 2:
         raise ConfigError("compare needs at least two results folders")
+    if len({folder.resolve() for folder in results}) < len(results):
+        raise ConfigError(
+            "a results folder is given more than once: it would agree with itself; leave it out"
+        )
     traces = [read_results(folder) for folder in results]
+    displaced = [f for f, t in zip(results, traces, strict=True) if _is_displacement(t)]
+    if 0 < len(displaced) < len(results):
+        raise ConfigError(
+            f"{', '.join(map(str, displaced))}: displacements from the first contact, the others are positions in the "
+            "base frame; compare only results of the same kind"
+        )
     paths, sigmas = zip(*(_path(t, f) for t, f in zip(traces, results, strict=True)), strict=True)
     mean = np.mean(paths, axis=0)  # (samples, 3)
     table = Table(title="Repeats against their mean")
@@ -53,14 +64,15 @@ def compare(
             f"{_rms(off - off[0]) * 1e3:.2f}",
             f"{sigma * 1e3:.2f}" if np.isfinite(sigma) else "none",
         )
-        table.add_row(str(folder), *values)
+        table.add_row(escape(str(folder)), *values)
     console = Console()
     console.print(table)
     spread = _rms(np.asarray(paths) - mean) * float(np.sqrt(len(paths) / (len(paths) - 1)))
-    claimed = float(np.nanmean(sigmas)) if np.isfinite(sigmas).any() else float("nan")
-    console.print(
-        f"Spread of the repeats {spread * 1e3:.2f} mm rms, claimed {claimed * 1e3:.2f} mm.", highlight=False
+    known_sigmas = np.isfinite(sigmas).any()
+    claimed = (
+        f"claimed {float(np.nanmean(sigmas)) * 1e3:.2f} mm" if known_sigmas else "no method here claims a σ"
     )
+    console.print(f"Spread of the repeats {spread * 1e3:.2f} mm rms, {claimed}.", highlight=False)
 
 
 def _path(trajectory: TipTrajectory, folder: Path) -> tuple[FloatArray, float]:
@@ -83,6 +95,13 @@ def _path(trajectory: TipTrajectory, folder: Path) -> tuple[FloatArray, float]:
     path = np.stack([np.interp(at, way[forward], p[forward, k]) for k in range(3)], axis=1)
     traces = [float(np.trace(e.covariance)) for e in rows if e.covariance is not None]
     return path, float(np.sqrt(np.mean(traces))) if traces else float("nan")
+
+
+def _is_displacement(trajectory: TipTrajectory) -> bool:
+    """Whether positions are relative to the first contact."""
+    from tiptrace.types import Status
+
+    return any(e.status is Status.RELATIVE for e in trajectory.estimates)
 
 
 def _rms(x: FloatArray) -> float:

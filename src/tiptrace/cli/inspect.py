@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -60,10 +61,11 @@ def inspect(
 
 
 def _table(found: Inspection) -> Table:
+    from rich.markup import escape
     from rich.table import Table
 
     kind = "tiptrace recording" if found.own_format else "recording of another origin"
-    table = Table(title=f"{found.path}: {kind}, {found.duration_s:.2f} s", title_justify="left")
+    table = Table(title=escape(f"{found.path}: {kind}, {found.duration_s:.2f} s"), title_justify="left")
     table.add_column("topic", overflow="fold")
     table.add_column("type", overflow="fold")
     for name in ("count", "rate\nHz", "longest\ngap s", "from … to\ns", "header −\nlog s"):
@@ -72,8 +74,8 @@ def _table(found: Inspection) -> Table:
     table.add_column("used as", overflow="fold")
     for topic in found.topics:
         table.add_row(
-            topic.topic,
-            topic.type.replace("/msg/", "/"),
+            escape(topic.topic),
+            escape(topic.type.replace("/msg/", "/")),
             str(topic.count),
             _number(topic.rate_hz, 1),
             _number(topic.longest_gap_s, 3),
@@ -96,25 +98,25 @@ def _verdict(found: Inspection, write_map: Path | None) -> list[str]:
 
     lines = []
     if found.attachments:
-        lines.append(
-            "attachments: " + ", ".join(f"{name} ({size} B)" for name, size in found.attachments.items())
-        )
+        names = ", ".join(f"{name} ({size} B)" for name, size in found.attachments.items())
+        lines.append(escape(f"attachments: {names}"))
     lines += [f"[yellow]note:[/] {escape(note)}" for note in found.notes]
     lines += [f"[red]problem:[/] {escape(problem)}" for problem in found.problems]
     if found.proposed_map is not None and write_map is None:
         lines += [
             "",
             "proposed map (--write-map map.yaml writes it; read it over):",
-            dump_yaml(found.proposed_map),
+            escape(dump_yaml(found.proposed_map)),
         ]
+    path = escape(shlex.quote(str(found.path)))
     if not found.usable:
         lines.append("[bold red]not usable as it is[/]")
     elif found.own_format:
-        lines.append(f"[bold green]usable[/]: tiptrace reconstruct {found.path} --out results")
+        lines.append(f"[bold green]usable[/]: tiptrace reconstruct {path} --out results")
     else:
-        name = write_map or "map.yaml"
+        name = escape(shlex.quote(str(write_map or "map.yaml")))
         lines.append(
-            f"[bold green]usable[/] with a map and a rig file: tiptrace reconstruct {found.path} --map {name} "
+            f"[bold green]usable[/] with a map and a rig file: tiptrace reconstruct {path} --map {name} "
             "--rig rig.yaml --reference-frames 0:20 --out results"
         )
     return lines

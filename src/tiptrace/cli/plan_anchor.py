@@ -63,7 +63,7 @@ def plan_anchor(
         f"Expected force up to {chosen.force_n:.1f} N, abort above {ABORT_RATIO * chosen.force_n:.1f} N. "
         f"Written to {out}",
     ):
-        console.print(line, highlight=False, soft_wrap=True)
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 
 def _table(predictions: list[Prediction], motion: str) -> object:

@@ -25,7 +25,7 @@ def print_results(result: Reconstruction, title: str) -> None:
 
     console = Console()
     rows = result_rows(result.methods, result.truth)
-    table = Table(title=title)
+    table = Table(title=escape(title))
     table.add_column("")
     for row in rows:
         table.add_column(row.cells[0], justify="right", style="dim" if row.published else "")
@@ -37,4 +37,4 @@ def print_results(result: Reconstruction, title: str) -> None:
     colour = {"pass": "green", "warn": "yellow", "fail": "red"}[result.quality.verdict]
     console.print(f"quality without ground truth: [{colour}]{result.quality.verdict}[/]")
     for reason in result.quality.reasons:
-        console.print(f"  · {reason}", highlight=False)
+        console.print(f"  · {reason}", highlight=False, markup=False)

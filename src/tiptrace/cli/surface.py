@@ -51,7 +51,7 @@ def surface(
         console.print(f"note: {escape(note)}", highlight=False)
     if out is not None:
         write_surface(out, fit)
-        console.print(f"Written to {out}")
+        console.print(f"Written to {out}", highlight=False, markup=False, soft_wrap=True)
 
 
 def _trace(path: Path) -> Trace:

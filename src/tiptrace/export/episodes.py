@@ -120,7 +120,7 @@ def find_sources(
     """
     sources: dict[Path, Source] = {}
     failures: list[tuple[str, str]] = []
-    recordings = []
+    recordings, notes = [], list[str]()
     for path in paths:
         results = sorted(file.parent for file in path.rglob(CSV)) if path.is_dir() else []
         if not results:
@@ -134,16 +134,21 @@ def find_sources(
             for file in sorted(path.rglob(_SUMMARY))
             if not (file.parent / CSV).exists()
         ]
-    notes: tuple[str, ...] = ()
+        if unused := sum(1 for _ in path.rglob("*.mcap")):
+            notes.append(
+                f"{path}: holds results, and these are exported; {unused} recording(s) beside them are not: give them "
+                "by name to trace them"
+            )
     if recordings:
         found = find_recordings(recordings, bags)
-        notes, failures = found.notes, [*failures, *found.empty]
+        notes += found.notes
+        failures = [*failures, *found.empty]
         sources |= {i.path.resolve(): Source(i.name, i.path, False) for i in found.recordings}
     ordered = sorted(sources.values(), key=lambda s: s.name)
     twice = {a.name for a, b in pairwise(ordered) if a.name == b.name}
     if twice:
         raise ConfigError(f"more than one episode of the name {', '.join(sorted(twice))}; export them apart")
-    return ordered, failures, list(notes)
+    return ordered, failures, notes
 
 
 class EpisodeWatch(FrameWatch):
