@@ -72,7 +72,7 @@ class Camera(_Model):
 
     source: str | None = None
     serial: str | None = None
-    fourcc: str | None = None
+    fourcc: Annotated[str, Field(pattern=r"^[ -~]{4}$")] | None = None
     size_px: tuple[int, int] | None = None
     crop_px: tuple[int, int, int, int] | None = None
     flip: Literal["none", "horizontal", "vertical", "both"] | None = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 import time
 import zlib
 from collections.abc import Sequence
@@ -15,11 +16,13 @@ import pytest
 from tests.live.servers import FPS, Fault, Feed, MjpegServer, feed_from
 from tests.streams.helpers import SIZE, make_rig, texture
 from tiptrace.drivers.base import DeviceStatus, Frame
+from tiptrace.drivers.camera import SourceLostError
 from tiptrace.drivers.jpeg_scan import warm_up
+from tiptrace.drivers.mjpeg import MjpegSource
 from tiptrace.drivers.opening import camera_source, open_camera
 from tiptrace.drivers.picture import Framing, Novelty, PictureError, decode_jpeg, encode_jpeg, inspect_jpeg
 from tiptrace.drivers.timeline import NS, ClockMap, Timeline
-from tiptrace.drivers.v4l2 import find_camera
+from tiptrace.drivers.v4l2 import find_camera, list_cameras
 from tiptrace.errors import ConfigError, DeviceError
 from tiptrace.types import ImageSample, PoseSample
 
@@ -168,9 +171,9 @@ def test_a_missing_server_is_named() -> None:
         camera.start(lambda: None)
 
 
-@pytest.mark.parametrize("uri", ["/dev/video0", "0", "gelsight", "ftp://host/x"])
+@pytest.mark.parametrize("uri", ["/dev/video0", "0", "gelsight", "ftp://host/x", "http://[::1", "http:///x"])
 def test_addresses_that_mean_nothing_are_refused(uri: str) -> None:
-    with pytest.raises(ConfigError):
+    with pytest.raises((ConfigError, DeviceError)):
         camera_source(uri, make_rig().sensors.left, Timeline())
 
 
@@ -203,6 +206,57 @@ def test_cameras_are_found_by_serial_number_and_by_path(machine: Path) -> None:
         find_camera("v4l2:S9", machine)
     with pytest.raises(ConfigError, match="number changes"):
         find_camera("/dev/video0", machine)
+
+
+def test_cameras_of_one_serial_number_are_named_by_their_ports(machine: Path) -> None:
+    """udev makes one link of both in by-id, to whichever came last."""
+    (machine / "dev/v4l/by-id/usb-C-video-index0").unlink()
+    ports = machine / "dev/v4l/by-path"
+    ports.mkdir()
+    for number in range(3):
+        for kind in ("usb", "usbv2"):
+            link = ports / f"pci-0000:00:14.0-{kind}-0:{number}:1.0-video-index0"
+            link.symlink_to(machine / f"dev/video{number}")
+    (ports / "platform-codec-video-index0").symlink_to(machine / "dev/video9")  # no camera
+    found = list_cameras(machine)
+    assert [camera.path.parent.name for camera in found] == ["by-id", "by-path", "by-path"]
+    assert len({camera.device for camera in found}) == 3
+    for camera in found:
+        again = find_camera("/" + str(camera.path.relative_to(machine)), machine)
+        assert again.device == camera.device
+    with pytest.raises(DeviceError, match=r"usb-0:1:1\.0.*usb-0:2:1\.0"):
+        find_camera("v4l2:S2", machine)
+
+
+@pytest.mark.parametrize(
+    ("told", "sent"),
+    [
+        ('"frame"; charset=x', "--frame"),
+        ("--frame", "--frame"),
+        ("--frame", "----frame"),
+        ("=_x", "--=_x"),
+    ],
+)
+def test_servers_write_the_boundary_in_many_ways(feed: Feed, told: str, sent: str) -> None:
+    jpegs = feed.jpegs["left"]
+
+    class Server(MjpegServer):
+        def handle(self, connection: socket.socket) -> None:
+            connection.recv(4096)
+            head = f"HTTP/1.0 200 OK\r\nContent-Type: Multipart/X-Mixed-Replace; boundary={told}\r\n\r\n"
+            connection.sendall(head.encode())
+            for jpeg in jpegs[:5]:
+                connection.sendall(f"{sent}\r\nContent-Length: {len(jpeg)}\r\n\r\n".encode() + jpeg + b"\r\n")
+            connection.sendall(f"{sent}--\r\n".encode())
+
+    server = Server("left", feed, time.monotonic())
+    source = MjpegSource(server.url, Timeline())
+    source.connect()
+    assert [source.read().jpeg for _ in range(5)] == jpegs[:5]
+    with pytest.raises(SourceLostError, match="ended the stream"):
+        source.read()
+    source.disconnect()
+    server.close()
 
 
 def test_the_least_delay_tells_the_clocks_apart() -> None:

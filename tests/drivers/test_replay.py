@@ -54,6 +54,7 @@ def test_a_recordings_poses_and_frame_are_played(tmp_path: Path) -> None:
         ("", "expected a csv file with the columns"),
         (HEADER + "0,1,2\n", "line 2"),
         (HEADER + "0,0,0,0,0,0,0,2\n", "line 2"),
+        (HEADER + "0,nan,0,0,0,0,0,1\n", "not finite"),
         (HEADER + "0,300,0,0,0,0,0,1\n", "millimetres"),
         (HEADER + "5,0,0,0,0,0,0,1\n5,0,0,0,0,0,0,1\n", "must increase"),
         (HEADER + "5,0,0,0,0,0,0,1\n", "holds no poses"),

@@ -108,13 +108,22 @@ def test_a_jump_is_told_from_fast_motion() -> None:
 
 
 @pytest.mark.usefixtures("client")
-def test_a_robot_that_is_not_there_is_named() -> None:
+@pytest.mark.parametrize("host", ["127.0.0.1", "no..name"])
+def test_a_robot_that_is_not_there_is_named(host: str) -> None:
     with pytest.raises(DeviceError, match="robot cannot be reached"):
-        open_robot("ur://127.0.0.1", Timeline()).start(lambda: None)
+        open_robot(f"ur://{host}", Timeline()).start(lambda: None)
 
 
 @pytest.mark.parametrize(
-    "uri", ["ur://", "ur://host?opening_register=7", "ur://host?speed=1", "kuka://host", "replay:none.csv"]
+    "uri",
+    [
+        "ur://",
+        "ur://[host",
+        "ur://host?opening_register=7",
+        "ur://host?speed=1",
+        "kuka://host",
+        "replay:none.csv",
+    ],
 )
 def test_addresses_that_mean_nothing_are_refused(uri: str) -> None:
     if uri.startswith("ur://"):

@@ -31,7 +31,10 @@ class MjpegSource:
     def __init__(self, url: str, timeline: Timeline) -> None:
         self.name = url
         self._timeline = timeline
-        self._url = urlsplit(url)
+        try:
+            self._url = urlsplit(url)
+        except ValueError:  # brackets that enclose no address
+            self._url = urlsplit("")
         if self._url.scheme not in ("http", "https") or not self._url.hostname:
             raise DeviceError(f"{url}: is no address of a camera; expected http://HOST:PORT/PATH")
         self._connection: http.client.HTTPConnection | None = None
@@ -60,14 +63,14 @@ class MjpegSource:
                 f"{self.name}: cannot be reached ({_why(error)}): check the address, and that the camera's server runs"
             ) from None
         kind_of = response.getheader("Content-Type", "")
-        if response.status != 200 or "multipart" not in kind_of:
+        if response.status != 200 or "multipart" not in kind_of.lower():
             self.disconnect()
             raise DeviceError(
                 f"{self.name}: is no MJPEG stream (answer {response.status}, {kind_of or 'no type'}): give the "
                 "address of the stream, such as http://HOST:8080/?action=stream"
             )
-        boundary = kind_of.partition("boundary=")[2].strip().strip('"').split(";")[0]
-        self._boundary = b"--" + boundary.removeprefix("--").encode("latin-1", "replace")
+        boundary = response.headers.get_boundary("") or ""
+        self._boundary = boundary.lstrip("-").encode("latin-1", "replace")
         self._response = response
         self._clock = ClockMap()
 
@@ -113,12 +116,15 @@ class MjpegSource:
         skipped = 0
         while True:
             line = _line(response)
-            if line.startswith(self._boundary):
+            name = line.strip().lstrip(
+                b"-"
+            )  # some servers count the delimiter's own hyphens among the name's
+            if line.startswith(b"--") and name.startswith(self._boundary):
                 break
             skipped += len(line)
             if skipped > _MAX_PART:
                 raise ValueError("no boundary between images")
-        if line.rstrip() == self._boundary + b"--":
+        if name == self._boundary + b"--":
             raise ConnectionError("the server ended the stream")
         first_ns = self._timeline.now_ns()
         headers: dict[bytes, bytes] = {}

@@ -12,7 +12,9 @@ from tiptrace.drivers.picture import Framing
 from tiptrace.drivers.timeline import Timeline
 from tiptrace.errors import ConfigError, DeviceError
 
-CAMERA_FORMS = "v4l2:SERIAL, /dev/v4l/by-id/NAME, http://HOST:PORT/PATH, or a video file"
+CAMERA_FORMS = (
+    "v4l2:SERIAL, /dev/v4l/by-id/NAME, /dev/v4l/by-path/NAME, http://HOST:PORT/PATH, or a video file"
+)
 ROBOT_FORMS = "ur://HOST, ros2, replay:FILE.csv, replay:FILE.mcap, or none"
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 from itertools import pairwise
 from pathlib import Path
 
@@ -108,6 +109,8 @@ def _from_mcap(path: Path) -> tuple[list[PoseSample], str | None]:
 
 
 def _pose(stamp_ns: int, t: tuple[float, float, float], q: list[float]) -> PoseSample:
+    if not all(map(math.isfinite, (*t, *q))):
+        raise ValueError("a number of the pose is not finite")
     if max(abs(c) for c in t) > _REACH_M:
         raise ValueError(f"position {t} is beyond {_REACH_M:g} m: it looks like millimetres; give metres")
     return PoseSample(stamp_ns, transform(rotation_from_quaternion(np.asarray(q)), np.asarray(t)))

@@ -43,7 +43,10 @@ class UrRobot(QueuedRobot):
     """
 
     def __init__(self, uri: str, timeline: Timeline) -> None:
-        parts = urlsplit(uri)
+        try:
+            parts = urlsplit(uri)
+        except ValueError:  # brackets that enclose no address
+            parts = urlsplit("")
         if not parts.hostname:
             raise ConfigError(f"{uri}: names no robot; expected ur://HOST")
         self._host = parts.hostname
@@ -127,7 +130,7 @@ class UrRobot(QueuedRobot):
         remedy = "check the address, that the arm is on, and that the network cable is plugged in"
         try:
             _shake_hands(self._host)
-        except OSError as error:
+        except (OSError, UnicodeError) as error:  # a name that can be none is a UnicodeError
             why = getattr(error, "strerror", None) or str(error)
             raise DeviceError(
                 f"{self.name}: robot cannot be reached on port {_PORT} ({why}): {remedy}"

@@ -1,4 +1,4 @@
-"""Cameras of this machine, by serial number or by-id path; never by an index, which changes with the plugging."""
+"""Cameras of this machine, by serial number or stable path; never by an index, which changes with the plugging."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tiptrace.drivers.timeline import NS, Timeline
 from tiptrace.errors import ConfigError, DeviceError
 
 _MAX_STAMP_AGE_NS = NS
-_BY_ID = "dev/v4l/by-id"
+_BY_ID, _BY_PATH = "dev/v4l/by-id", "dev/v4l/by-path"
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +25,8 @@ class FoundCamera:
     """A camera as the kernel names it.
 
     Attributes:
-        path: Stable path, ``/dev/v4l/by-id/…``.
+        path: Stable path: ``/dev/v4l/by-id/…``, or ``/dev/v4l/by-path/…``, the USB port, where another camera has the
+            same serial number: those share one name in by-id, which is that of either.
         device: What it points to now, ``/dev/videoN``.
         name: Product name.
         serial: USB serial number; empty where the device has none.
@@ -39,25 +40,34 @@ class FoundCamera:
 
 def list_cameras(root: Path = Path("/")) -> list[FoundCamera]:
     """Capture devices with a stable path, sorted by it; ``root`` is another file system in tests."""
-    folder = root / _BY_ID
-    if not folder.is_dir():
-        return []
+    by_id, by_port = _links(root / _BY_ID), _links(root / _BY_PATH, "-usb")
+    facts = {
+        device: (_read(sys / "name"), _read(sys / "device" / ".." / "serial"))
+        for device in {**by_id, **by_port}
+        for sys in [root / "sys/class/video4linux" / device.name]
+    }
+    serials = [serial for _, serial in facts.values()]
     found = []
-    for link in sorted(folder.iterdir()):
-        if not link.name.endswith("-index0"):
-            continue  # the others carry metadata
-        device = link.resolve()
-        sys = root / "sys/class/video4linux" / device.name
-        serial = _read(sys / "device" / ".." / "serial")
-        found.append(FoundCamera(link, device, _read(sys / "name") or link.name, serial))
-    return found
+    for device, (name, serial) in facts.items():
+        alone = device in by_id and serials.count(serial) == 1
+        path = by_id[device] if alone else by_port.get(device) or by_id[device]
+        found.append(FoundCamera(path, device, name or path.name, serial))
+    return sorted(found, key=lambda camera: camera.path)
+
+
+def _links(folder: Path, part: str = "") -> dict[Path, Path]:
+    """Device → link to it, of those that carry pictures: the others, not index 0, carry metadata."""
+    if not folder.is_dir():
+        return {}
+    links = sorted(folder.iterdir(), reverse=True)  # of several links to a device the first one stays
+    return {link.resolve(): link for link in links if link.name.endswith("-index0") and part in link.name}
 
 
 def find_camera(uri: str, root: Path = Path("/")) -> FoundCamera:
     """The camera that an address means.
 
     Args:
-        uri: ``v4l2:SERIAL`` or ``/dev/v4l/by-id/NAME``.
+        uri: ``v4l2:SERIAL``, ``/dev/v4l/by-id/NAME`` or ``/dev/v4l/by-path/NAME``.
         root: Of the file system.
 
     Raises:
@@ -67,12 +77,15 @@ def find_camera(uri: str, root: Path = Path("/")) -> FoundCamera:
     if uri.startswith("/dev/video"):
         raise ConfigError(
             f"camera {uri!r}: the number changes with the order of plugging, so left and right may be exchanged; give "
-            "v4l2:SERIAL or /dev/v4l/by-id/NAME (tiptrace doctor lists them)"
+            "v4l2:SERIAL, or a path in /dev/v4l/by-id or by-path (tiptrace doctor lists them)"
         )
     cameras = list_cameras(root)
     serial = uri.removeprefix("v4l2:") if uri.startswith("v4l2:") else None
     if serial is None:
-        matches = [c for c in cameras if c.path == root / uri.lstrip("/")]
+        link = root / uri.lstrip("/")
+        matches = [
+            c for c in cameras if link.parent.parent == root / "dev/v4l" and c.device == link.resolve()
+        ]
     else:
         matches = [c for c in cameras if serial and c.serial == serial]
     if len(matches) > 1:
