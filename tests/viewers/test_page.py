@@ -152,8 +152,12 @@ def test_addresses():
     assert parse_address("") == ("127.0.0.1", 8321)
     assert parse_address("9000") == ("127.0.0.1", 9000)
     assert parse_address("0.0.0.0:80") == ("0.0.0.0", 80)
-    with pytest.raises(ConfigError, match="HOST:PORT"):
-        parse_address("here:there")
+    assert parse_address("[::1]:80") == ("::1", 80)
+    for text in ("here:there", ":²", "::1", "1:2:3", "127.0.0.1:99999"):
+        with pytest.raises(ConfigError, match="HOST:PORT"):
+            parse_address(text)
+    with pytest.raises(OutputError, match="cannot listen"), PageServer("no..name"):
+        pass
 
 
 class Session:

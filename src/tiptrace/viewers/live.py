@@ -89,7 +89,8 @@ def parse_address(text: str) -> tuple[str, int]:
     """
     host, colon, port = text.rpartition(":")
     if not colon:
-        host, port = ("", text) if text.isdigit() else (text, "")
-    if port and not (port.isdigit() and int(port) < 65536):
+        host, port = ("", text) if text.isdecimal() else (text, "")
+    bare = ":" in host and not (host.startswith("[") and host.endswith("]"))  # which colon is it?
+    if bare or (port and not (port.isdecimal() and int(port) < 65536)):
         raise ConfigError(f"address {text!r}: expected HOST:PORT, for example 127.0.0.1:{DEFAULT_PORT}")
     return host.strip("[]") or "127.0.0.1", int(port) if port else DEFAULT_PORT

@@ -77,11 +77,12 @@ class PageServer:
         try:
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             self._socket.bind((self.host, self._port))
-        except OSError as error:
+        except (OSError, UnicodeError) as error:  # a name that can be none is a UnicodeError
             self._socket.close()
+            why = getattr(error, "strerror", None) or "no such name"
             raise OutputError(
-                f"page: cannot listen on {self.host}:{self._port} ({error.strerror}); "
-                "give another address, such as --serve 127.0.0.1:8322"
+                f"page: cannot listen on {self.host}:{self._port} ({why}); "
+                "give another address, such as 127.0.0.1:8322"
             ) from None
         self._port = int(self._socket.getsockname()[1])
         config = uvicorn.Config(
