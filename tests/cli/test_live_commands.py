@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -15,12 +17,18 @@ from typer.testing import CliRunner
 from tests.live.servers import FPS, Feed, MjpegServer, feed_from
 from tests.live.simulated import short_trial
 from tiptrace.cli import app
+from tiptrace.cli.live_terminal import keys
 from tiptrace.config import Rig, dump_yaml, load_yaml
-from tiptrace.drivers.timeline import NS
+from tiptrace.drivers.base import Frame
+from tiptrace.drivers.no_robot import NoRobot
+from tiptrace.drivers.timeline import NS, Timeline
 from tiptrace.errors import ConfigError, DeviceError, RecordingError, TipTraceError
-from tiptrace.live.setup import crop_for
+from tiptrace.live.setup import crop_for, with_gel_models
+from tiptrace.live.start import read_rig_folder
+from tiptrace.streams.live import LiveStream
 from tiptrace.streams.recording import Recording
-from tiptrace.types import SIDES, ImageSample, PoseSample, Side
+from tiptrace.streams.writer import RecordingWriter
+from tiptrace.types import SIDES, ImageSample, Phase, PoseSample, Side
 
 runner = CliRunner()
 
@@ -88,6 +96,31 @@ def test_record_writes_what_the_devices_sent(
     assert "exists already" in str(error)
 
 
+def test_an_image_is_logged_when_it_came_however_long_it_then_waits(rig_file: Path) -> None:
+    """Else a machine that stands still makes the recording's two clocks differ, and it is refused."""
+    timeline = Timeline()
+    logged: list[int] = []
+    stream = LiveStream(load_yaml(Rig, rig_file), {}, NoRobot(), timeline)
+    stream.tap = lambda sample, log_time_ns, jpeg: logged.append(log_time_ns)
+    stream.begin()
+    stamp = timeline.now_ns()
+    time.sleep(0.1)
+    stream._tap_frame("left", Frame(stamp, stamp + 1_000_000, np.zeros((2, 2, 3), np.uint8)))
+    assert logged == [stamp + 1_000_000]
+
+
+def test_an_unfinished_recording_of_the_name_is_refused_before_anything_is_opened(
+    rig_file: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "trial.partial.mcap").write_bytes(b"what was saved")
+    options = ["--rig", str(rig_file), "--robot", "ur://nowhere"]
+    for command in (["record", "--out"], ["live", "--record"]):
+        _, output, error = run(*command, str(tmp_path / "trial.mcap"), *options)
+        assert isinstance(error, RecordingError)
+        assert "trial.partial.mcap: exists already" in str(error)
+        assert "recording:" not in output
+
+
 def test_live_prints_estimates_and_a_summary(cameras: list[str], rig_file: Path, poses: str) -> None:
     code, output, _ = run("live", "--rig", str(rig_file), "--robot", poses, "--duration", "3", *cameras)
     assert code == 0, output
@@ -104,6 +137,8 @@ def test_live_prints_estimates_and_a_summary(cameras: list[str], rig_file: Path,
         (["--left", "SAME", "--right", "SAME"], ConfigError, "same camera"),
         (["--robot", "kuka"], ConfigError, "give ur://HOST"),
         (["--robot", "replay:missing.csv"], DeviceError, "cannot be read"),
+        (["--robot", "none"], ConfigError, "tiptrace record"),
+        (["--serve", "here:there"], ConfigError, "HOST:PORT"),
     ],
 )
 def test_what_is_missing_is_named(
@@ -122,6 +157,74 @@ def test_doctor_measures_and_names_what_fails(cameras: list[str], rig_file: Path
     assert code == 2
     assert "replay" in output or "missing.csv" in output
     assert "→" in output
+
+
+def test_doctor_tells_what_live_would_refuse(cameras: list[str], rig_file: Path, tmp_path: Path) -> None:
+    path = tmp_path / "trial.mcap"
+    rig = load_yaml(Rig, rig_file)
+    with RecordingWriter(path, rig=rig) as writer:
+        for k in range(300):
+            writer.write(PoseSample(NS + k * 10_000_000, np.eye(4)))
+    other = rig.model_copy(update={"frames": rig.frames.model_copy(update={"base": "base_link"})})
+    rig_file.write_text(dump_yaml(other))
+    arguments = ["--rig", str(rig_file), "--robot", f"replay:{path}", "--seconds", "0.5", *cameras]
+    code, output, _ = run("doctor", *arguments)
+    assert code == 2
+    assert "fail robot's pose: the robot's pose is given in 'base'" in output
+    _, _, error = run("doctor", *cameras)
+    assert isinstance(error, ConfigError)
+    assert "--rig" in str(error)
+
+
+def test_live_without_a_reference_is_refused_before_anything_is_opened(rig_file: Path) -> None:
+    (rig_file.parent / "reference_right.png").unlink()
+    _, _, error = run("live", "--rig", str(rig_file), "--robot", "ur://nowhere")
+    assert isinstance(error, ConfigError)
+    assert "reference_right.png" in str(error)
+    assert "tiptrace setup" in str(error)
+
+
+# --- keys --------------------------------------------------------------------------------------------------
+
+
+class Marks:
+    """Takes marks."""
+
+    def __init__(self) -> None:
+        self.told: list[str] = []
+
+    def advance(self) -> Phase | None:
+        self.told.append("mark")
+        return None
+
+    def stop(self) -> None:
+        self.told.append("stop")
+
+
+@pytest.mark.parametrize(
+    ("typed", "told"),
+    [
+        ([(0.0, b" ")], ["mark"]),
+        ([(0.0, b" "), (0.5, b" "), (0.1, b"  "), (0.1, b"   ")], ["mark"]),  # held down
+        ([(0.0, b"   "), (1.0, b"q")], ["mark", "stop"]),  # nothing is left over from the first
+        ([(0.0, b" "), (1.0, b" ")], ["mark", "mark"]),
+        ([(0.0, b"x")], []),
+    ],
+)
+def test_a_held_key_is_one_mark_and_each_key_is_taken_when_pressed(
+    typed: list[tuple[float, bytes]], told: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    master, slave = os.openpty()
+    session = Marks()
+    with os.fdopen(slave, "r") as terminal:
+        monkeypatch.setattr(sys, "stdin", terminal)
+        with keys(session):
+            for wait_s, pressed in typed:
+                time.sleep(wait_s)
+                os.write(master, pressed)
+            time.sleep(0.3)
+        os.close(master)
+    assert session.told == told
 
 
 # --- setup -------------------------------------------------------------------------------------------------
@@ -200,6 +303,19 @@ def test_setup_learns_the_sides_by_touch_and_writes_the_rig(
     _, _, error = run("setup", "--from", str(template), "--camera", "http://127.0.0.1:9/")
     assert isinstance(error, DeviceError)
     assert "two cameras are needed" in str(error)
+
+
+def test_a_gel_model_beside_the_old_rig_file_is_found_from_the_new_one(tmp_path: Path) -> None:
+    (tmp_path / "gel.onnx").write_bytes(b"a model")
+    rig = short_trial()[0]
+    left = rig.sensors.left.model_copy(update={"gel_model": "gel.onnx"})
+    rig = rig.model_copy(update={"sensors": rig.sensors.model_copy(update={"left": left})})
+    moved = tmp_path / "elsewhere"
+    moved.mkdir()
+    (moved / "rig.yaml").write_text(dump_yaml(with_gel_models(rig, tmp_path)))
+    folder = read_rig_folder(moved / "rig.yaml")
+    assert list(folder.gel_models.values()) == [b"a model"]
+    assert folder.rig.sensors.right.gel_model == rig.sensors.right.gel_model
 
 
 def test_the_crop_keeps_the_aspect_ratio_and_the_middle() -> None:

@@ -26,10 +26,13 @@ def doctor(
     from rich.console import Console
     from rich.markup import escape
 
+    from tiptrace.errors import ConfigError
     from tiptrace.live.checkup import Finding, check_devices, check_extras, check_machine
     from tiptrace.live.start import camera_addresses, read_rig_folder
     from tiptrace.types import SIDES
 
+    if rig is None and (left is not None or right is not None):
+        raise ConfigError("--left and --right are measured as the rig file says: give --rig too")
     console, failed = Console(), 0
 
     def show(finding: Finding) -> None:
@@ -45,18 +48,19 @@ def doctor(
 
     for finding in [*check_extras(), *check_machine(Path.cwd())]:
         show(finding)
-    addresses, sensors = {}, {}
+    addresses, sensors, frames = {}, {}, None
     if rig is not None:
         folder = read_rig_folder(rig)
         addresses = {
             str(k): v for k, v in camera_addresses(folder.rig, {"left": left, "right": right}).items()
         }
+        frames = folder.rig.frames
         sensors = {str(side): folder.rig.sensor(side) for side in SIDES}
         for side in SIDES:
             has = side in folder.references
             remedy = "" if has else "tiptrace setup takes it"
             show(Finding(f"{side} reference", "ok" if has else "fail", "there" if has else "missing", remedy))
-    for finding in check_devices(addresses, sensors, robot, seconds):
+    for finding in check_devices(addresses, sensors, robot, seconds, frames):
         show(finding)
     if failed:
         console.print(f"{failed} of these need attention", style="red")

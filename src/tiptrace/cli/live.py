@@ -10,11 +10,12 @@ import typer
 
 if TYPE_CHECKING:
     from tiptrace.live.session import LiveSession
+    from tiptrace.live.start import RigFolder
 
 
 def live(
     rig: Annotated[Path, typer.Option(help="rig.yaml, with references beside it (tiptrace setup).")],
-    robot: Annotated[str, typer.Option(help="ur://HOST, ros2, replay:FILE, or none.")],
+    robot: Annotated[str, typer.Option(help="ur://HOST, ros2, or replay:FILE.")],
     left: Annotated[str | None, typer.Option(help="Left camera, in place of the rig file's.")] = None,
     right: Annotated[str | None, typer.Option(help="Right camera, in place of the rig file's.")] = None,
     method: Annotated[str, typer.Option(help="full, paper, or a baseline.")] = "full",
@@ -49,13 +50,40 @@ def live(
         read_rig_folder,
         refuse_to_overwrite,
     )
+    from tiptrace.viewers.live import parse_address
 
     folder = read_rig_folder(rig, tool)
+    _check_enough(folder, robot)
+    if serve is not None:
+        parse_address(serve)
     if record is not None:
         refuse_to_overwrite(record)
     addresses = camera_addresses(folder.rig, {"left": left, "right": right})
     session = make_session(folder, addresses, robot, method=method, out=record, wait_for_mark=wait)
     run_session(session, duration, view=view, serve=serve)
+
+
+def _check_enough(folder: RigFolder, robot: str) -> None:
+    """What a recording can do without and an estimate cannot, told before anything is opened.
+
+    Raises:
+        ConfigError: no robot, or no image of an untouched gel.
+    """
+    from tiptrace.errors import ConfigError
+    from tiptrace.streams.topics import REFERENCE_FILE
+    from tiptrace.types import SIDES
+
+    if robot == "none":
+        raise ConfigError(
+            "--robot none: without poses no tip can be traced; give the robot, or record the images alone with "
+            "tiptrace record"
+        )
+    for side in SIDES:
+        if side not in folder.references:
+            raise ConfigError(
+                f"no {REFERENCE_FILE[side]} beside the rig file: depth is measured against the untouched gel; take it "
+                "with tiptrace setup, or put it there"
+            )
 
 
 def run_session(
@@ -81,7 +109,9 @@ def run_session(
             stack.enter_context(session.stream)
             print_gel_health(console, {str(k): v for k, v in gel_health(session.stream).items()})
             if view or serve is not None:
-                console.print(stack.enter_context(_viewer(session, view, serve)), highlight=False)
+                console.print(
+                    stack.enter_context(_viewer(session, view, serve)), highlight=False, markup=False
+                )
             stack.enter_context(Terminal(session, console).shown())
             stack.enter_context(keys(session))
             try:
@@ -91,7 +121,9 @@ def run_session(
     finally:
         signal.signal(signal.SIGTERM, before)
         if session.recorder is not None and session.recorder.file.exists():
-            console.print(f"recording: {session.recorder.file}", highlight=False, soft_wrap=True)
+            console.print(
+                f"recording: {session.recorder.file}", highlight=False, markup=False, soft_wrap=True
+            )
     print_summary(console, summary)
     if session.recorder is not None and session.recorder.error is not None:
         raise session.recorder.error

@@ -23,6 +23,7 @@ from tiptrace.types import Phase, Status
 
 _REFRESH_S = 0.2
 _LINE_S = 1.0
+_HELD_S = 0.8  # a held key is one mark: terminals wait for up to 0.7 s before they repeat it
 _COLOURS = {
     Status.OK: "green",
     Status.ANCHORING: "cyan",
@@ -169,8 +170,8 @@ def print_summary(console: Console, summary: LiveSummary) -> None:
 
 @contextmanager
 def keys(session: Marked) -> Iterator[None]:
-    """Space marks the next phase, q and Ctrl-C end the session; nothing where the input is no terminal."""
-    if not sys.stdin.isatty():
+    """Space marks the next phase, q and Ctrl-C end the session; nothing where no key can come."""
+    if not sys.stdin.isatty() or _in_background(sys.stdin.fileno()):
         yield
         return
     import termios
@@ -190,17 +191,34 @@ def keys(session: Marked) -> Iterator[None]:
         termios.tcsetattr(number, termios.TCSADRAIN, before)
 
 
+def _in_background(number: int) -> bool:
+    """Whether the terminal belongs to another job: to change it would stop this one."""
+    import os
+
+    try:
+        return os.tcgetpgrp(number) != os.getpgrp()
+    except OSError:
+        return False  # a terminal that controls nothing
+
+
 def _listen(session: Marked, done: threading.Event) -> None:
+    import os
     import select
 
-    last = 0.0
+    number, last = sys.stdin.fileno(), 0.0
     while not done.is_set():
-        ready, _, _ = select.select([sys.stdin], [], [], 0.2)
+        ready, _, _ = select.select([number], [], [], 0.2)
         if not ready:
             continue
-        key = sys.stdin.read(1)
-        if key == " " and time.monotonic() - last > 0.3:  # a held key is one mark
-            last = time.monotonic()
-            session.advance()
-        elif key == "q":
+        try:
+            pressed = os.read(number, 256)  # all of it: what a buffer keeps would be taken with the next key
+        except OSError:
+            return  # the terminal is gone
+        if not pressed:
+            return
+        if b"q" in pressed:
             session.stop()
+        elif b" " in pressed:
+            if time.monotonic() - last > _HELD_S:
+                session.advance()
+            last = time.monotonic()

@@ -57,15 +57,18 @@ def record(
             stack.enter_context(stream)
             print_gel_health(console, {str(k): v for k, v in gel_health(stream).items()})
             stack.enter_context(keys(session))
-            console.print(f"recording {out}; " + ("space begins, " if wait else "") + "q or Ctrl-C stops")
+            begins = "space begins, " if wait else ""
+            console.print(f"recording {out}; {begins}q or Ctrl-C stops", markup=False, soft_wrap=True)
             try:
                 summary = session.run(duration)
             except KeyboardInterrupt:
                 summary = None
+                if recorder.error is not None:
+                    raise recorder.error from None
     finally:
         signal.signal(signal.SIGTERM, before)
         if recorder.file.exists():
-            console.print(f"recording: {recorder.file}", highlight=False, soft_wrap=True)
+            console.print(f"recording: {recorder.file}", highlight=False, markup=False, soft_wrap=True)
     console.print(device_table(stream.health()))
     if summary is not None:
         text = f"{summary.images} images, {summary.poses} poses in {summary.seconds:.1f} s"

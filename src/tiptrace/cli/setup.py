@@ -35,14 +35,14 @@ def setup(
     from tiptrace.config import Rig, load_yaml
     from tiptrace.drivers.opening import open_robot
     from tiptrace.drivers.timeline import Timeline
-    from tiptrace.live.setup import Setup, candidates, refuse_an_old_rig
+    from tiptrace.live.setup import Setup, candidates, refuse_an_old_rig, with_gel_models
     from tiptrace.streams.live import check_frames
     from tiptrace.types import SIDES
 
     console = Console()
-    rig = load_yaml(Rig, start_from)
+    rig = with_gel_models(load_yaml(Rig, start_from), start_from.parent)
     refuse_an_old_rig(out)
-    if robot is not None:
+    if robot is not None and robot != "none":
         device = open_robot(robot, Timeline())
         check_frames(device.frames, rig.frames)
         try:
@@ -50,16 +50,21 @@ def setup(
             check_frames(device.frames, rig.frames)
         finally:
             device.close()
-        console.print(f"robot: {robot} sends poses", highlight=False)
+        console.print(f"robot: {robot} sends poses", highlight=False, markup=False)
     helper = Setup(
-        rig, candidates(camera or []), lambda text: console.print(text, highlight=False), crop=crop
+        rig,
+        candidates(camera or []),
+        lambda text: console.print(text, highlight=False, markup=False),
+        crop=crop,
     )
     found = helper.identify(timeout)
     sensors = {side: helper.sensor(side, found[side]) for side in SIDES}
     console.print("taking the references: do not touch the gels")
     references = {side: helper.reference(side, sensors[side], found[side]) for side in SIDES}
     path = helper.write(out, sensors, references)
-    console.print(f"written: {path}, with the references beside it", highlight=False, soft_wrap=True)
+    console.print(
+        f"written: {path}, with the references beside it", highlight=False, markup=False, soft_wrap=True
+    )
     if crop:
         console.print(
             "mm_per_px belongs to the crop: calibrate the rig again if it was another (tiptrace calibrate rig)",

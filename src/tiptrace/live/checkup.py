@@ -9,14 +9,15 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Literal, cast
 
-from tiptrace.config import Sensor
+from tiptrace.config import Frames, Sensor
 from tiptrace.drivers.base import Camera, DeviceHealth, DeviceStatus, Robot
 from tiptrace.drivers.opening import open_camera, open_robot
 from tiptrace.drivers.timeline import Timeline
 from tiptrace.drivers.v4l2 import list_cameras
-from tiptrace.errors import TipTraceError
+from tiptrace.errors import ConfigError, TipTraceError
+from tiptrace.streams.live import check_frames
 
 Verdict = Literal["ok", "note", "fail"]
 
@@ -28,6 +29,7 @@ _EXTRAS = {  # extra → module that tells whether it is there
     "viz": "rerun",
 }
 _LEAST_RATE_HZ = {"camera": 15.0, "robot": 20.0}
+_FASTER = {"camera": "a smaller size_px helps", "robot": "end other programs, use a cable in place of Wi-Fi"}
 _MOST_JITTER_MS = 15.0
 _LEAST_FREE_GB = 2.0
 _MOST_DRIFT_MS = 5.0
@@ -91,7 +93,11 @@ def check_machine(folder: Path) -> Iterator[Finding]:
 
 
 def check_devices(
-    addresses: Mapping[str, str], sensors: Mapping[str, Sensor], robot: str | None, seconds: float = 5.0
+    addresses: Mapping[str, str],
+    sensors: Mapping[str, Sensor],
+    robot: str | None,
+    seconds: float = 5.0,
+    frames: Frames | None = None,
 ) -> Iterator[Finding]:
     """Rates and jitter of cameras and robot, all running together for some seconds, and the clock meanwhile."""
     timeline = Timeline()
@@ -106,6 +112,8 @@ def check_devices(
             _watch(running, seconds)
         for name, device in running.items():
             yield _judge(name, device.health())
+            if name == "robot" and frames is not None:
+                yield from _check_frames(cast(Robot, device), frames)
         drift_ms = abs(timeline.wall_error_ns()) * 1e-6
         steady = drift_ms < _MOST_DRIFT_MS
         yield Finding(
@@ -133,6 +141,15 @@ def _start(
         running[name] = device
 
 
+def _check_frames(robot: Robot, frames: Frames) -> Iterator[Finding]:
+    """A finding only where the pose is not the one that the rig file means."""
+    try:
+        check_frames(robot.frames, frames)
+    except ConfigError as error:
+        sentence, _, remedy = str(error).partition(": ")
+        yield Finding("robot's pose", "fail", sentence, remedy)
+
+
 def _watch(running: Mapping[str, Camera | Robot], seconds: float) -> None:
     end = time.monotonic() + seconds
     while time.monotonic() < end:
@@ -146,11 +163,13 @@ def _judge(name: str, health: DeviceHealth) -> Finding:
     kind = "robot" if name == "robot" else "camera"
     faults = ", ".join(f"{fault} {count}" for fault, count in health.faults if fault != "dropped")
     detail = f"{health.name}: {rate:.1f} Hz, jitter {jitter:.1f} ms" + (f", {faults}" if faults else "")
+    if health.status is DeviceStatus.ENDED:
+        return Finding(name, "note", f"{detail}; the file is over", "give a longer one, or fewer --seconds")
     if health.status is not DeviceStatus.OK:
         return Finding(name, "fail", f"{detail}; {health.status.value}", "check its cable and its server")
     if rate < _LEAST_RATE_HZ[kind]:
         return Finding(
-            name, "fail", detail, f"at least {_LEAST_RATE_HZ[kind]:g} Hz are needed: a smaller size_px helps"
+            name, "fail", detail, f"at least {_LEAST_RATE_HZ[kind]:g} Hz are needed: {_FASTER[kind]}"
         )
     if jitter > _MOST_JITTER_MS:
         return Finding(

@@ -97,9 +97,10 @@ class Setup:
         Raises:
             DeviceError: a camera that does not start, no touch in time, or the same camera twice.
         """
-        plain = self._rig.sensors.left.model_copy(
-            update={"image_size_px": _LOOK_PX, "camera": None}
-        )  # look at all of it
+        told = self._rig.sensors.left.camera or CameraSettings()
+        plain = self._rig.sensors.left.model_copy(  # look at all of it
+            update={"image_size_px": _LOOK_PX, "camera": CameraSettings(fourcc=told.fourcc)}
+        )
         opened: list[Candidate] = []
         try:
             for address in self._addresses:
@@ -129,15 +130,15 @@ class Setup:
             DeviceError: the camera does not start.
         """
         old = self._rig.sensor(side)
-        size = self._source_size(address)
+        size = self._source_size(address, old)
         crop = crop_for(size, old.image_size_px) if self._crop else None
         camera = (old.camera or CameraSettings()).model_copy(
             update={"source": address, "size_px": size, "crop_px": crop}
         )
         return old.model_copy(update={"camera": camera})
 
-    def _source_size(self, address: str) -> tuple[int, int]:
-        source = camera_source(address, self._rig.sensors.left, self._timeline)
+    def _source_size(self, address: str, sensor: Sensor) -> tuple[int, int]:
+        source = camera_source(address, sensor, self._timeline)
         source.connect()
         try:
             for _ in range(_TRIED_FRAMES):  # the first ones of a camera may be damaged
@@ -187,6 +188,16 @@ class Setup:
         except OSError as error:
             raise OutputError(f"{path}: cannot be written ({error.strerror})") from None
         return path
+
+
+def with_gel_models(rig: Rig, folder: Path) -> Rig:
+    """The rig, for a file in another folder: gel models that lie beside the old one are named by their whole path."""
+    sensors = {}
+    for side in SIDES:
+        sensor, model = rig.sensor(side), folder / rig.sensor(side).gel_model
+        update = {"gel_model": str(model.resolve())} if model.is_file() else {}
+        sensors[str(side)] = sensor.model_copy(update=update)
+    return rig.model_copy(update={"sensors": rig.sensors.model_copy(update=sensors)})
 
 
 def refuse_an_old_rig(folder: Path) -> None:

@@ -18,6 +18,7 @@ from tiptrace.perception.gel_model import load_gel_model
 from tiptrace.streams.live import LiveStream
 from tiptrace.streams.recording import check_reference, decode_reference
 from tiptrace.streams.topics import REFERENCE_FILE, TOOL_FILE
+from tiptrace.streams.writer import unfinished
 from tiptrace.tracer import METHODS
 from tiptrace.types import SIDES, Image, Side
 
@@ -156,12 +157,13 @@ def gel_health(stream: LiveStream) -> dict[Side, GelHealth | str]:
 
 
 def refuse_to_overwrite(path: Path) -> None:
-    """The target must be an ``.mcap`` file that is not there yet.
+    """The target must be an ``.mcap`` file that is not there yet, nor an unfinished one of its name.
 
     Raises:
         RecordingError: it is, or it is none.
     """
     if path.suffix != ".mcap":
         raise RecordingError(f"{path}: recordings are MCAP files: give a name that ends in .mcap")
-    if path.exists():
-        raise RecordingError(f"{path}: exists already; move it away, or give another name")
+    for taken in (path, unfinished(path)):
+        if taken.exists():
+            raise RecordingError(f"{taken}: exists already; move it away, or give another name")

@@ -258,7 +258,8 @@ class LiveStream:
             self.tap(sample, log_time_ns, jpeg)
 
     def _tap_frame(self, side: Side, frame: Frame) -> None:
-        self._tap(ImageSample(side, frame.stamp_ns, frame.image), self.timeline.now_ns(), frame.jpeg)
+        """Logged at the image's arrival: a machine that then takes its time with it makes no clocks differ."""
+        self._tap(ImageSample(side, frame.stamp_ns, frame.image), frame.arrived_ns, frame.jpeg)
 
     def _tap_robot(self, sample: RobotSample, arrived_ns: int) -> None:
         """Phase marks come back through :meth:`mark`; openings are dated by their log time, here as offline."""

@@ -43,6 +43,11 @@ from tiptrace.types import (
 _CHUNK_BYTES = 64 * 1024  # about 0.1 s of two 25 Hz image streams: what a crash or a cut can cost
 
 
+def unfinished(path: Path) -> Path:
+    """What a recording is called while it is written."""
+    return path.with_name(f"{path.stem}.partial.mcap")
+
+
 class RecordingWriter:
     """Context manager that writes one trial.
 
@@ -79,7 +84,7 @@ class RecordingWriter:
     ) -> None:
         self.path = path
         self._overwrite, self._chunk_bytes = overwrite, chunk_bytes
-        self.partial_path = path.with_name(f"{path.stem}.partial.mcap")
+        self.partial_path = unfinished(path)
         self._base = rig.frames.base
         self._image_format = image_format
         self._jpeg_quality = jpeg_quality
