@@ -12,6 +12,7 @@ import pytest
 from tiptrace.errors import OutputError
 from tiptrace.evaluation.analytic import CENTRELINES
 from tiptrace.evaluation.conditions import Condition, distinct_conditions
+from tiptrace.evaluation.figures_suite import error_distribution, overlays
 from tiptrace.evaluation.records import TrialRecord
 from tiptrace.evaluation.suite_report import SuiteData, write_suite_report
 from tiptrace.evaluation.traces import TrialTraces
@@ -28,6 +29,20 @@ def traces() -> Iterator[tuple[Condition, TrialTraces]]:
     for condition in distinct_conditions():
         p = CENTRELINES[condition.trajectory].offset(np.linspace(0, 0.2, 50)) * 1e3
         yield condition, TrialTraces(p, {"full": p + 0.1, "paper": p + 5.0})
+
+
+def test_titles_of_a_single_condition_stay_within_the_picture():
+    figure = overlays(list(traces())[:1], "local-anchoring")
+    figure.draw_without_rendering()
+    box = figure.texts[0].get_window_extent()
+    assert box.x0 >= 0
+    assert box.x1 <= figure.bbox.x1
+
+
+def test_a_single_trial_is_seen_in_the_distribution():
+    figure = error_distribution([r for r in suite(1) if r.method == "full"][:1])
+    (line,) = figure.axes[0].lines
+    assert np.ptp(np.asarray(line.get_ydata(), dtype=float)) == 1.0
 
 
 def test_the_page_holds_tables_figures_and_outliers(tmp_path: Path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from textwrap import fill
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -121,7 +122,8 @@ def overlays(traces: Iterable[tuple[Condition, TrialTraces]], method: str) -> Fi
         by_condition.setdefault(condition, []).append(trace)
     sets = _sets_with(by_condition)
     columns = max((len(c) for c in sets.values()), default=1)
-    figure = style.new_figure(max(4.0, 1.92 * columns), 0.4 + 1.5 * max(1, len(sets)))
+    width_in = max(4.0, 1.92 * columns)
+    figure = style.new_figure(width_in, 0.4 + 1.5 * max(1, len(sets)))
     axes = figure.subplots(max(1, len(sets)), columns, sharex=True, sharey="row", squeeze=False)
     colour, _ = style.method_style(method)
     for row, (name, conditions) in zip(axes, sets.items(), strict=False):
@@ -136,9 +138,8 @@ def overlays(traces: Iterable[tuple[Condition, TrialTraces]], method: str) -> Fi
         lowest = [ax for ax in column if ax.axison][-1]
         lowest.set_xlabel("x [mm]")
         lowest.tick_params(labelbottom=True)
-    figure.suptitle(
-        f"{method} (colour) over the true tip (grey), top view from the start, y stretched", fontsize=9
-    )
+    title = f"{method} (colour) over the true tip (grey), top view from the start, y stretched"
+    figure.suptitle(fill(title, int(14 * width_in)), fontsize=9)
     return figure
 
 
@@ -182,8 +183,8 @@ def error_distribution(records: Sequence[TrialRecord], metric: str = "trajectory
         colour, dash = style.method_style(method, k)
         share = np.arange(1, len(values) + 1) / max(1, trials)  # failures never come within any error
         ax.step(
-            values,
-            share,
+            np.concatenate([values[:1], values]),  # up from 0: a single trial is a line, too
+            np.concatenate([np.zeros(len(values[:1])), share]),
             where="post",
             color=colour,
             linestyle=dash,
