@@ -7,7 +7,6 @@ from tiptrace.config import Sensor, Transform
 from tiptrace.errors import PerceptionError
 from tiptrace.perception.finger import Finger
 from tiptrace.perception.lifting import sample_map
-from tiptrace.perception.planar import MotionPatch
 from tiptrace.perception.settings import SensingConfig
 
 from .gel_images import S_M, H, W, bump, grid, linear_gel, paint_dots, shade, to_uint8
@@ -83,12 +82,6 @@ def test_without_a_network_the_patch_comes_from_motion():
     order = np.linalg.norm(finger.markers.uv_px[:, None] - grid()[None], axis=2).argmin(axis=1)
     np.testing.assert_allclose(-markers.x_S[:, 2], np.where(patch[order], 0.7e-3, 0.0))
     assert finger.depth_m is None
-
-
-def test_patch_without_evidence_is_everything():
-    rest = grid()
-    patch = MotionPatch(rest)
-    assert patch.update(rest + 0.1, np.ones(len(rest), bool)).all()
 
 
 def test_another_gel_than_the_rig_says():
