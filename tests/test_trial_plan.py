@@ -61,7 +61,9 @@ def test_recordings_in_folders_each_once_with_the_truth_of_their_name(tmp_path: 
         [tmp_path / "a.mcap", tmp_path / "b", tmp_path / "a.mcap"], truth, "T2", [0.0, 0.0, 0.0], {}
     )
     assert [Path(t.name).name for t in tasks] == ["a.mcap", "1.mcap", "2.mcap"]
-    assert len(notes) == 1
+    assert [Path(n.partition(":")[0]).name for n in notes] == ["a.mcap", "a.mcap", "2.mcap"]
+    assert sum("given more than once" in n for n in notes) == 1
+    assert sum("what the recording itself holds counts" in n for n in notes) == 2
     sources = [json.loads(t.source) for t in tasks]
     assert [s["truth"] for s in sources] == [None, str(truth / "1.tum"), None]
     assert sources[0]["analytic"] == {"centreline": "T2", "start_m": [0.0, 0.0, 0.0]}
