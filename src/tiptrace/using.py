@@ -9,7 +9,7 @@ from typing import Literal, cast
 
 import numpy as np
 
-from tiptrace.config import Rig, Tool, load_yaml
+from tiptrace.config import Tool, load_yaml
 from tiptrace.errors import ConfigError, GeometryError
 from tiptrace.estimation.anchor import TipPrior
 from tiptrace.estimation.full import FullEstimator
@@ -119,7 +119,7 @@ class Using:
                 ) from None
             return TracerOptions(depth=depth, tool=tool, use_stage_one=False)
         if self.anchor_from is not None:
-            grasp = load_grasp(self.anchor_from, stream.rig, depth)
+            grasp = load_grasp(self.anchor_from, depth)
             _same_tool(grasp, stream.tool, self.anchor_from)
             return TracerOptions(depth=depth, anchor_from=self._carried(grasp))
         if self.relative:
@@ -133,8 +133,8 @@ class Using:
         return TipPrior(grasp.tip.c, inflated)
 
 
-def load_grasp(source: Path, rig: Rig | None = None, depth: Literal["network", "none"] = "network") -> Grasp:
-    """The grasp of a results folder, or of a recording, which is traced for it.
+def load_grasp(source: Path, depth: Literal["network", "none"] = "network") -> Grasp:
+    """The grasp of a results folder, or of a recording, which is traced for it with the rig that is attached to it.
 
     Raises:
         TipTraceError: it cannot be read, or its anchor was refused.

@@ -38,7 +38,9 @@ def reconstruct(
     ] = None,
     anchor_from: Annotated[
         Path | None,
-        typer.Option(help="No Stage I: results or recording of another trial with the same grasp."),
+        typer.Option(
+            help="No Stage I: results, or recording with its own rig, of another trial with the same grasp."
+        ),
     ] = None,
     regrasp: Annotated[
         bool, typer.Option("--regrasp", help="The tool was gripped anew since --anchor-from: less certain.")
