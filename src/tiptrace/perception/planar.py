@@ -10,7 +10,9 @@ opening imply, the others none.
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
+from tiptrace.compiled import compiled
 from tiptrace.types import BoolArray, FloatArray
 
 _EVIDENCE_PX = 0.4  # motion of the strongest markers below which a frame says nothing
@@ -21,7 +23,7 @@ _OFF_PX, _OFF = (
     0.3,
     0.3,
 )  # distance from the rigid motion, and its share of the motion, that still count as shared
-_STRETCH = 0.5, 0.15  # px, and share of the motion, by which a proposing pair may change its length
+_STRETCH_PX, _STRETCH = 0.5, 0.15  # change of a proposing pair's length, and its share of the motion
 _MOST_PX = 8.0  # motion beyond which a frame weighs no more
 _ENOUGH_PX2 = 20.0  # squared motion, summed, from which on the patch is told
 _SHARE = 0.5  # of the strongest markers' agreement that the patch has
@@ -39,7 +41,8 @@ class MotionPatch:
         np.fill_diagonal(distance, np.inf)
         pitch = float(np.median(distance.min(axis=1)))
         near, far = _PAIR
-        self._i, self._j = np.nonzero(np.triu((distance > near * pitch) & (distance < far * pitch)))
+        i, j = np.nonzero(np.triu((distance > near * pitch) & (distance < far * pitch)))
+        self._pairs = np.column_stack([i, j])  # (m, 2)
         self._shared, self._seen = np.zeros(len(rest_px)), np.zeros(len(rest_px))  # px² of motion, summed
 
     def update(self, uv_px: FloatArray, tracked: BoolArray) -> BoolArray:
@@ -75,37 +78,26 @@ class MotionPatch:
     def _shared_motion(
         self, d: FloatArray, tracked: BoolArray, weight: FloatArray, off: FloatArray
     ) -> FloatArray | None:
-        """Displacements (n, 2) of the rigid motion that the most weight (n,) comes within ``off`` (n,) of."""
+        """Displacements (n, 2) of the rigid motion that most weight (n,) shares to within ``off`` (n,)."""
         x = self._start
-        use = tracked[self._i] & tracked[self._j]
-        i, j = self._i[use], self._j[use]
-        a = x[j] - x[i]  # (m, 2)
-        b = a + d[j] - d[i]
-        px, share = _STRETCH
-        stretch = np.abs(np.linalg.norm(b, axis=1) - np.linalg.norm(a, axis=1))
-        rigid = stretch < px + share * np.linalg.norm(np.stack([d[i], d[j]]), axis=2).max(axis=0)
-        i, j, a, b = i[rigid], j[rigid], a[rigid], b[rigid]
-        if not len(i):
+        score, angle, *place = _best_proposal(self._pairs, x, d, tracked, weight, off)
+        if score == 0.0:
             return None
-        angle = np.arctan2(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0], np.sum(a * b, axis=1))
-        proposed = _turned(x, angle, 0.5 * (x[i] + x[j]), 0.5 * (d[i] + d[j]))  # (m, n, 2)
-        square = np.sum((d - proposed) ** 2, axis=2) / off**2
-        score = np.clip(1.0 - square, 0.0, None) @ np.where(tracked, weight, 0.0)
-        p = proposed[int(np.argmax(score))]
+        centre, shift = np.array(place).reshape(2, 2)
+        p = _turned(x, angle, centre, shift)
         for _ in range(2):
             shared = tracked & (np.linalg.norm(d - p, axis=1) < off)
             if shared.sum() < 3:
                 break
             p = _rigid_fit(x, d, shared)
-        return np.asarray(p)
+        return p
 
 
-def _turned(x: FloatArray, angle: FloatArray, centre: FloatArray, shift: FloatArray) -> FloatArray:
-    """Displacements (m, n, 2) of places x (n, 2) under rotations (m,) about centres (m, 2) that are shifted (m, 2)."""
-    r = x[None] - centre[:, None]
-    c, s = np.cos(angle)[:, None] - 1.0, np.sin(angle)[:, None]
-    turned = np.stack([c * r[..., 0] - s * r[..., 1], s * r[..., 0] + c * r[..., 1]], axis=2)
-    return np.asarray(turned + shift[:, None])
+def _turned(x: FloatArray, angle: float, centre: FloatArray, shift: FloatArray) -> FloatArray:
+    """Displacements (n, 2) of places x (n, 2) under a rotation about a centre (2,) that is shifted (2,)."""
+    r = x - centre
+    c, s = np.cos(angle) - 1.0, np.sin(angle)
+    return np.asarray(np.stack([c * r[:, 0] - s * r[:, 1], s * r[:, 0] + c * r[:, 1]], axis=1) + shift)
 
 
 def _rigid_fit(x: FloatArray, d: FloatArray, chosen: BoolArray) -> FloatArray:
@@ -113,5 +105,41 @@ def _rigid_fit(x: FloatArray, d: FloatArray, chosen: BoolArray) -> FloatArray:
     a, b = x[chosen], x[chosen] + d[chosen]
     centre, to = a.mean(axis=0), b.mean(axis=0)
     H = (a - centre).T @ (b - to)
-    angle = np.arctan2(H[0, 1] - H[1, 0], H[0, 0] + H[1, 1])
-    return np.asarray(_turned(x, np.array([angle]), centre[None], (to - centre)[None])[0])
+    angle = float(np.arctan2(H[0, 1] - H[1, 0], H[0, 0] + H[1, 1]))
+    return _turned(x, angle, centre, to - centre)
+
+
+@compiled
+def _best_proposal(
+    pairs: NDArray[np.intp],
+    x: FloatArray,
+    d: FloatArray,
+    tracked: BoolArray,
+    weight: FloatArray,
+    off: FloatArray,
+) -> tuple[float, float, float, float, float, float]:
+    """Score, angle, centre and shift (u, v each) of the pair's motion that most weight shares; score 0: none."""
+    best = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    for e in range(len(pairs)):
+        i, j = pairs[e, 0], pairs[e, 1]
+        if not (tracked[i] and tracked[j]):
+            continue
+        au, av = x[j, 0] - x[i, 0], x[j, 1] - x[i, 1]
+        bu, bv = au + d[j, 0] - d[i, 0], av + d[j, 1] - d[i, 1]
+        further = max(np.hypot(d[i, 0], d[i, 1]), np.hypot(d[j, 0], d[j, 1]))
+        if abs(np.hypot(bu, bv) - np.hypot(au, av)) >= _STRETCH_PX + _STRETCH * further:
+            continue
+        angle = np.arctan2(au * bv - av * bu, au * bu + av * bv)
+        c, s = np.cos(angle) - 1.0, np.sin(angle)
+        u, v = 0.5 * (x[i, 0] + x[j, 0]), 0.5 * (x[i, 1] + x[j, 1])
+        du, dv = 0.5 * (d[i, 0] + d[j, 0]), 0.5 * (d[i, 1] + d[j, 1])
+        score = 0.0
+        for k in range(len(x)):
+            if tracked[k]:
+                ru, rv = x[k, 0] - u, x[k, 1] - v
+                eu = d[k, 0] - (c * ru - s * rv + du)
+                ev = d[k, 1] - (s * ru + c * rv + dv)
+                score += weight[k] * max(1.0 - (eu * eu + ev * ev) / off[k] ** 2, 0.0)
+        if score > best[0]:
+            best = (score, angle, u, v, du, dv)
+    return best

@@ -10,6 +10,7 @@ from tiptrace.perception.depth import untouched_gel
 from tiptrace.perception.full_depth import FullDepth
 from tiptrace.perception.gel_model import load_gel_model
 from tiptrace.perception.lifters import FullLifter
+from tiptrace.perception.planar import MotionPatch
 from tiptrace.perception.registration import RegisteredTracker
 from tiptrace.perception.seeding import seed
 from tiptrace.types import Image
@@ -31,6 +32,9 @@ def warm_up() -> None:
     lift = FullLifter(depth, tracker, seeds.ghosts)
     tracker.update(_dots(0.5 * _PITCH_PX))  # a leap
     uv_px, tracked = tracker.update(_dots(1.6))
+    patch = MotionPatch(seeds.rest_px)
+    for shift_px in (0.0, 1.6):
+        patch.update(seeds.rest_px + shift_px, tracked)
     map_ = lift(image, uv_px, tracked).map
     if map_ is not None:
         untouched_gel(map_.depth_m, np.zeros((*map_.depth_m.shape, 2), dtype=np.float32))
