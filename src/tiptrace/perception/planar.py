@@ -19,10 +19,7 @@ _EVIDENCE_PX = 0.4  # motion of the strongest markers below which a frame says n
 _STRONG = 85.0  # percentile that counts as the strongest
 _CAP = 0.3  # of the strongest: a marker's motion counts up to this, or to the median
 _PAIR = (1.5, 3.3)  # pitches between the two markers that propose a rigid motion
-_OFF_PX, _OFF = (
-    0.3,
-    0.3,
-)  # distance from the rigid motion, and its share of the motion, that still count as shared
+_OFF_PX, _OFF = 0.3, 0.3  # distance from the rigid motion, and its share of it, that count as shared
 _STRETCH_PX, _STRETCH = 0.5, 0.15  # change of a proposing pair's length, and its share of the motion
 _MOST_PX = 8.0  # motion beyond which a frame weighs no more
 _ENOUGH_PX2 = 20.0  # squared motion, summed, from which on the patch is told
