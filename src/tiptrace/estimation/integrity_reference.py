@@ -28,9 +28,7 @@ class IntegrityConfig(BaseModel):
     # residual of the rigid fit beyond which it is none: in multiples of Stage I's, and at least
     misfit: float = Field(default=4.0, gt=1)
     misfit_m: float = Field(default=1.5e-4, gt=0)
-    tilt_beyond_rad: float = Field(
-        default=0.07, gt=0
-    )  # of the tool across the pads, beyond Stage I's furthest
+    tilt_beyond_rad: float = Field(default=0.07, gt=0)  # of the tool across the pads, over Stage I's furthest
     again_frames: int = Field(default=10, ge=1)  # of misfit, after which markers are matched to dots anew
     twist_limit_rad: float = Field(default=0.03, gt=0)  # of one pad's markers against the other's
     twist_frames: int = Field(default=3, ge=1)
