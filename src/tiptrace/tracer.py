@@ -184,6 +184,17 @@ METHODS: dict[str, str] = {
 }
 
 
+def require_methods(*names: str) -> None:
+    """Before any work is done.
+
+    Raises:
+        ConfigError: a name that is none of :data:`METHODS`, which are listed.
+    """
+    unknown = [f"'{name}'" for name in names if name not in METHODS]
+    if unknown:
+        raise ConfigError(f"unknown method {', '.join(unknown)}; valid: {', '.join(METHODS)}")
+
+
 def sensing_of(method: str) -> Literal["paper", "full"]:
     """Which sensing chain a method runs on."""
     return "paper" if method == "paper" else "full"
@@ -205,12 +216,13 @@ def make_estimator(
             its own Stage I and is told not to.
         GeometryError: ``nominal-tip`` or ``use_stage_one = False`` without a tip in the tool's file.
     """
+    require_methods(method)
     tool = options.tool or stream.tool
     if method == "nominal-tip":
         return NominalTipEstimator(tool)
     if method == "full":
         return _full(stream, tool, options)
-    if method in METHODS and options.anchored_elsewhere:
+    if options.anchored_elsewhere:
         raise ConfigError(
             f"method '{method}' anchors by its own Stage I; --tip and --anchor-from need method full"
         )
@@ -220,11 +232,9 @@ def make_estimator(
         return EeOnlyEstimator(_full(stream, tool, options))
     if method == "local-anchoring":
         return LocalAnchoringEstimator()
-    if method == "ee-oracle":
-        if truth_at is None:
-            raise ConfigError("method 'ee-oracle' needs a ground truth, which this trial does not have")
-        return EeOracleEstimator(truth_at)
-    raise ConfigError(f"unknown method '{method}'; valid: {', '.join(METHODS)}")
+    if truth_at is None:  # what is left is ee-oracle
+        raise ConfigError("method 'ee-oracle' needs a ground truth, which this trial does not have")
+    return EeOracleEstimator(truth_at)
 
 
 def _full(stream: Stream, tool: Tool | None, options: TracerOptions) -> FullEstimator:

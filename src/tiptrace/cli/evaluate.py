@@ -81,11 +81,12 @@ def evaluate(
     from tiptrace.evaluation.suite_store import SuiteStore
     from tiptrace.evaluation.suite_values import without_truth
     from tiptrace.evaluation.versions import library_versions
+    from tiptrace.tracer import require_methods
     from tiptrace.trial_plan import recording_tasks, suite_tasks
     from tiptrace.trial_runs import inputs_of
 
     names = list(dict.fromkeys(m.strip() for m in methods.split(",") if m.strip()))
-    _check_methods(names)
+    require_methods(*names or [""])
     if bool(paths) == bool(suite):
         raise ConfigError("give recordings, or --suite paper|quick; not both, not neither")
     _check_curve(analytic, start)
@@ -118,15 +119,6 @@ def evaluate(
     _show(console, records, _report(store, records, found, settings, suite))
     if any(r.failure for r in records) or without_truth(records):
         raise typer.Exit(1)
-
-
-def _check_methods(names: list[str]) -> None:
-    from tiptrace.errors import ConfigError
-    from tiptrace.tracer import METHODS
-
-    unknown = [m for m in names if m not in METHODS]
-    if unknown or not names:
-        raise ConfigError(f"unknown method(s) {', '.join(unknown) or '–'}; valid: {', '.join(METHODS)}")
 
 
 def _check_curve(analytic: str | None, start: str | None) -> None:

@@ -66,12 +66,11 @@ def export(
     from tiptrace.export.dataset import FORMATS, LeRobotOptions, export_dataset
     from tiptrace.export.episodes import find_sources
     from tiptrace.export.lerobot_reader import is_lerobot
-    from tiptrace.tracer import METHODS
+    from tiptrace.tracer import require_methods
 
     if to not in FORMATS:
         raise ConfigError(f"unknown format '{to}'; valid: {', '.join(FORMATS)}")
-    if method not in METHODS:
-        raise ConfigError(f"unknown method '{method}'; valid: {', '.join(METHODS)}")
+    require_methods(method)
     target = out or Path(f"tip.{to}")
     if any(is_lerobot(path) for path in paths):
         references: dict[Side, Path | None] = {"left": reference_left, "right": reference_right}

@@ -90,14 +90,10 @@ def reconstruct(
     again, what fails is listed and the rest goes on (exit code 1).
     """
     from tiptrace.batch_plan import is_batch
-    from tiptrace.errors import ConfigError
-    from tiptrace.tracer import METHODS
+    from tiptrace.tracer import require_methods
     from tiptrace.using import Using
 
-    for name in (method, *(beside or ())):
-        if name not in METHODS:
-            raise ConfigError(f"unknown method '{name}'; valid: {', '.join(METHODS)}")
-
+    require_methods(method, *(beside or ()))
     using = Using(tip, anchor_from, regrasp, regrasp_sigma_mm * 1e-3, relative, depth, smooth)
     options: dict[str, Any] = {
         "map_file": map_file,

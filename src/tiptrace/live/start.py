@@ -19,7 +19,7 @@ from tiptrace.streams.live import LiveStream
 from tiptrace.streams.recording import check_reference, decode_reference
 from tiptrace.streams.topics import REFERENCE_FILE, TOOL_FILE
 from tiptrace.streams.writer import unfinished
-from tiptrace.tracer import METHODS
+from tiptrace.tracer import require_methods
 from tiptrace.types import SIDES, Image, Side
 
 
@@ -104,8 +104,7 @@ def make_session(
     Raises:
         TipTraceError: an address that means nothing, or a device that is not there.
     """
-    if method not in METHODS:
-        raise ConfigError(f"unknown method {method!r}; valid: {', '.join(METHODS)}")
+    require_methods(method)
     timeline, rig = Timeline(), folder.rig
     cameras = {
         side: open_camera(addresses[side], rig.sensor(side), timeline, encode=out is not None)
